@@ -1,0 +1,186 @@
+"""The command that reconstructs, for a person on a terminal or for a program on the wire."""
+
+import logging
+import os
+import platform
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from ..errors import Cancelled, ErrorCode, ReconstructionError
+from ..failures import explain_or_none, internal_error
+from ..wire import protocol
+from ..wire.speaker import Speaker, speaker
+from .cancelling import EXIT_CANCELLED, CancelRequest, catch_signals, watch_signals, watch_stdin
+
+if TYPE_CHECKING:
+    from ..pipeline import Job, Listener
+
+EXIT_FINE, EXIT_INTERNAL, EXIT_USER_ERROR = 0, 1, 2
+VERSION = "0.1.0"
+
+logger = logging.getLogger(__name__)
+
+
+def on_terminal(job: protocol.Job) -> int:
+    """Run the job with progress on stderr and the names of the results on stdout; the exit code."""
+    try:
+        from ..terminal import terminal_listener  # here, because rich may be missing
+    except ImportError as error:
+        known = explain_or_none(error) or internal_error(error)
+        sys.stderr.write(f"Error: {known.text}\n{known.remedy}\n")
+        return EXIT_USER_ERROR
+    request = CancelRequest()
+    with terminal_listener(request) as listener:
+        watch_signals(request, listener.stopping)
+        return settle(
+            lambda: listener.finished(Path(job.output), run_job(job, Path(), listener)),
+            failed=listener.failed,
+            cancelled=listener.cancelled,
+        )
+
+
+def on_wire(job_path: Path) -> int:
+    """Run the job of the file with messages on stdout; the exit code."""
+    request = CancelRequest()
+    with speaker() as speaking:
+        speaking.say(hello())
+        watch_signals(request, lambda: None)
+        watch_stdin(request)
+        return settle(
+            lambda: _run_job_file(job_path, request, speaking),
+            failed=lambda error: say_last(speaking, failed_message(error)),
+            cancelled=lambda: say_last(speaking, cancelled_message()),
+        )
+
+
+def settle(
+    work: Callable[[], None],
+    *,
+    failed: Callable[[ReconstructionError], None],
+    cancelled: Callable[[], None],
+) -> int:
+    """Do the work and tell how it ended; the exit code."""
+    try:
+        work()
+    except Cancelled:
+        cancelled()
+        return EXIT_CANCELLED
+    except Exception as error:  # the border of the program: nothing leaves without words
+        known = explain_or_none(error)
+        if known is None:
+            logger.exception("internal error")
+        failed(known or internal_error(error))
+        return EXIT_INTERNAL if known is None else EXIT_USER_ERROR
+    return EXIT_FINE
+
+
+def run_job(job: protocol.Job, base: Path, listener: "Listener") -> tuple[str, ...]:
+    """Reconstruct into the job's output folder; names of the files written."""
+    from .. import pipeline  # torch may be missing, and doctor must still start
+    from ..presets import PRESETS
+    from ..workspace import open_workspace
+
+    catch_signals()
+    resolved = resolve(job, base)
+    with open_workspace(resolved.output) as workspace:
+        try:
+            with _logging_to(workspace.log_path):
+                settings = PRESETS[job.preset]
+                return pipeline.run(
+                    resolved, workspace, settings=settings, stages=pipeline.STAGES, listener=listener
+                )
+        except (ReconstructionError, Cancelled):
+            workspace.discard_if_nothing_done()
+            raise
+
+
+def resolve(job: protocol.Job, base: Path) -> "Job":
+    """The job with paths; relative ones start at base."""
+    from ..pipeline import Job
+
+    def path_or_none(name: str | None) -> Path | None:
+        return None if name is None else base / name
+
+    return Job(
+        images=tuple(base / name for name in job.images),
+        output=base / job.output,
+        cameras=path_or_none(job.cameras),
+        masks=path_or_none(job.masks),
+        preset=job.preset,
+        device=job.device,
+        seed=job.seed,
+        truth=path_or_none(job.truth),
+    )
+
+
+def hello() -> protocol.Hello:
+    """First message of every conversation."""
+    return protocol.Hello(
+        protocol=protocol.PROTOCOL_VERSION,
+        backend=VERSION,
+        python=platform.python_version(),
+        pid=os.getpid(),
+    )
+
+
+def failed_message(error: ReconstructionError) -> protocol.Failed:
+    """The error as a last message."""
+    return protocol.Failed(code=error.code.value, text=error.text, remedy=error.remedy)
+
+
+def cancelled_message() -> protocol.Failed:
+    """The last message of a run that was stopped."""
+    return protocol.Failed(
+        code=protocol.CANCELLED,
+        text="The reconstruction was stopped; finished stages are kept.",
+        remedy="Start the same job again to resume.",
+    )
+
+
+def say_last(speaking: Speaker, message: protocol.Message) -> None:
+    """Send a message after which nothing may follow."""
+    speaking.silence()
+    speaking.say(message)
+
+
+def _run_job_file(job_path: Path, request: CancelRequest, speaking: Speaker) -> None:
+    from .wire_listener import WireListener
+
+    job = _read_job(job_path)
+    files = run_job(job, job_path.absolute().parent, WireListener(request, speaking))
+    output = job_path.absolute().parent / job.output
+    say_last(speaking, protocol.Finished(output=str(output), files=files))
+
+
+def _read_job(path: Path) -> protocol.Job:
+    """The job of the file; ReconstructionError(SETTINGS_INVALID) where it is none."""
+    remedy = "Write the file as backend/wire/protocol.py describes it."
+    try:
+        return protocol.decode_job(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, protocol.ProtocolError) as error:
+        text = f"The job file {path} cannot be used: {error}."
+        raise ReconstructionError(ErrorCode.SETTINGS_INVALID, text, remedy) from error
+
+
+@contextmanager
+def _logging_to(path: Path) -> Iterator[None]:
+    """Add what is logged to the file, and the trace of what ends the run."""
+    handler = logging.FileHandler(path, encoding="utf-8")
+    handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
+    root = logging.getLogger()
+    root.addHandler(handler)
+    logger.info("FewView %s, Python %s, %s", VERSION, platform.python_version(), sys.platform)
+    try:
+        yield
+    except Cancelled:
+        logger.info("stopped by the user")
+        raise
+    except Exception:
+        logger.info("the run ended early", exc_info=True)
+        raise
+    finally:
+        root.removeHandler(handler)
+        handler.close()

@@ -1,0 +1,111 @@
+"""Whether this Python can reconstruct: the only proof of "ready"."""
+
+import importlib
+import json
+import platform
+import sys
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from importlib.metadata import PackageNotFoundError, version
+
+MIN_PYTHON = (3, 11)
+DEPENDENCIES = {
+    # pillow stands before pycolmap: imported the other way round, the two corrupt memory.
+    "numpy": "numpy",
+    "PIL": "pillow",
+    "tifffile": "tifffile",
+    "scipy": "scipy",
+    "skimage": "scikit-image",
+    "torch": "torch",
+    "pycolmap": "pycolmap",
+    "trimesh": "trimesh",
+    "embreex": "embreex",
+    "fast_simplification": "fast-simplification",
+    "rich": "rich",
+    "jinja2": "jinja2",
+    "jaxtyping": "jaxtyping",
+}
+"""Import name of each needed package, with its name for pip."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Check:
+    """One thing that was looked at."""
+
+    name: str
+    fine: bool
+    found: str
+    """A version, a device or what is wrong."""
+
+
+def examine() -> tuple[Check, ...]:
+    """All checks: Python, each package, and, where torch loads, each device with a tiny computation."""
+    checks = [_check_python(), *(_check_package(name, pip) for name, pip in DEPENDENCIES.items())]
+    if all(check.fine for check in checks):
+        checks += _check_devices()
+    return tuple(checks)
+
+
+def is_ready(checks: tuple[Check, ...]) -> bool:
+    """Whether a reconstruction can start here."""
+    return all(check.fine for check in checks)
+
+
+def as_text(checks: tuple[Check, ...]) -> str:
+    """The checks for a person."""
+    width = max(len(check.name) for check in checks)
+    lines = [f"{'ok ' if check.fine else 'NOT'} {check.name:<{width}} {check.found}" for check in checks]
+    if is_ready(checks):
+        return "\n".join([*lines, "ready"])
+    remedy = "not ready: run `pip install .` in FewView's folder with this Python: " + sys.executable
+    return "\n".join([*lines, remedy])
+
+
+def as_json(checks: tuple[Check, ...]) -> str:
+    """The checks for a program."""
+    return json.dumps({"ready": is_ready(checks), "checks": [asdict(check) for check in checks]})
+
+
+def _check_python() -> Check:
+    fine = sys.version_info[:2] >= MIN_PYTHON
+    needed = "" if fine else f", at least {'.'.join(map(str, MIN_PYTHON))} is needed"
+    return Check(name="Python", fine=fine, found=platform.python_version() + needed)
+
+
+def _check_package(module: str, distribution: str) -> Check:
+    try:
+        importlib.import_module(module)
+    except (ImportError, OSError, AttributeError, ValueError, RuntimeError) as error:
+        # Beside a missing package: a library of the system it needs, or packages that do not fit together.
+        return Check(name=distribution, fine=False, found=f"{type(error).__name__}: {error}")
+    try:
+        return Check(name=distribution, fine=True, found=version(distribution))
+    except PackageNotFoundError:
+        return Check(name=distribution, fine=True, found="version unknown")
+
+
+def _check_devices() -> list[Check]:
+    from .machine import available_devices
+
+    return [_check_device(kind, name) for kind, name in available_devices().items()]
+
+
+def _check_device(kind: str, name: str, solve: Callable[[str], float] | None = None) -> Check:
+    """Fine if the device computes the gradient of a sum of squares, which is known."""
+    try:
+        error = (solve or _gradient_error)(kind)
+    except RuntimeError as reason:
+        return Check(name=kind, fine=False, found=f"{name}: {reason}")
+    wrong = "" if error < 1e-5 else f": computes wrongly (error {error:.2g})"
+    return Check(name=kind, fine=not wrong, found=name + wrong)
+
+
+def _gradient_error(kind: str) -> float:
+    """Largest error of d/dx sum((x A)^2) = 2 x A A^T on the device."""
+    import torch
+
+    matrix = torch.tensor([[1.0, 2.0], [3.0, 4.0]], device=kind)
+    x = torch.tensor([[0.5, -1.0]], device=kind, requires_grad=True)
+    (gradient,) = torch.autograd.grad((x @ matrix).square().sum(), x)
+    expected = 2 * x.detach() @ matrix @ matrix.T
+    return float((gradient - expected).abs().max())

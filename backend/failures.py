@@ -1,0 +1,53 @@
+"""From exceptions of the system and of libraries to words a user understands; standard library only."""
+
+import errno
+
+from .errors import ErrorCode, ReconstructionError
+
+_MEMORY_WORDS = ("out of memory", "not enough memory", "can't allocate memory", "cannot allocate memory")
+"""What torch says on its CUDA, CPU (Windows and Linux) and MPS paths, in a plain RuntimeError."""
+
+
+def explain_or_none(error: Exception) -> ReconstructionError | None:
+    """The failure as a ReconstructionError; None where it is a fault of the program."""
+    if isinstance(error, ReconstructionError):
+        return error
+    if isinstance(error, ImportError) and not (error.name or "").startswith("backend"):
+        return ReconstructionError(
+            ErrorCode.MISSING_DEPENDENCY,
+            f"A package that the reconstruction needs cannot be loaded: {error}.",
+            "Run `python -m backend doctor` to see what is missing, `pip install .` to install it.",
+        )
+    if _is_out_of_memory(error):
+        return ReconstructionError(
+            ErrorCode.OUT_OF_MEMORY,
+            "The computer ran out of memory.",
+            "Use a faster preset (--preset fast) or fewer photographs, or close other programs.",
+        )
+    if isinstance(error, OSError) and is_disk_full(error):
+        return ReconstructionError(
+            ErrorCode.DISK_FULL,
+            "The disk is full.",
+            "Free some space and start the same command again; finished stages are kept.",
+        )
+    return None
+
+
+def internal_error(error: Exception) -> ReconstructionError:
+    """What to tell the user about a fault of the program."""
+    return ReconstructionError(
+        ErrorCode.INTERNAL,
+        f"FewView failed unexpectedly: {type(error).__name__}: {error}",
+        "Please report this with log.txt from the output folder; finished stages are kept.",
+    )
+
+
+def is_disk_full(error: OSError) -> bool:
+    """Whether the disk, or the user's share of it, has no room left."""
+    return error.errno in (errno.ENOSPC, errno.EDQUOT)
+
+
+def _is_out_of_memory(error: Exception) -> bool:
+    if isinstance(error, MemoryError):
+        return True
+    return isinstance(error, RuntimeError) and any(words in str(error).lower() for words in _MEMORY_WORDS)

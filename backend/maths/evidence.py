@@ -1,0 +1,85 @@
+"""What photographs say about the nodes of a grid: signed distances near points, and free space.
+
+Near a measured point p with normal n the distance field is, to first order (Taylor), n . (q - p) at
+q; every point says so to the nodes around it, and the nodes take the mean. A node is free where a
+photograph sees through it: in front of what was measured there, or off the subject's silhouette.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from .geometry import Pinhole, inside, project, sample_image
+from .grid import node_positions, spacing
+
+
+@dataclass(frozen=True, kw_only=True)
+class PointDistances:
+    """First-order signed distances at nodes near points."""
+
+    distance: Float[Tensor, "nodes nodes nodes"]
+    weight: Float[Tensor, "nodes nodes nodes"]
+    """Sum of the confidences that spoke, by nearness; 0 where no point is near."""
+
+
+def point_distances(
+    positions: Float[Tensor, "points 3"],
+    normals: Float[Tensor, "points 3"],
+    confidence: Float[Tensor, "points"],
+    nodes: int,
+) -> PointDistances:
+    """Weighted mean of n . (q - p) over the points within two cells of each node q."""
+    h = spacing(nodes)
+    base = ((positions + 1) / h).floor().long()
+    sums = positions.new_zeros((nodes**3, 2))
+    for offset in _offsets(-1, 2, positions.device):
+        node = base + offset
+        valid = ((node >= 0) & (node < nodes)).all(dim=-1)
+        node = node[valid]
+        apart = node * h - 1 - positions[valid]
+        along = (apart * normals[valid]).sum(dim=-1)
+        across2 = (apart * apart).sum(dim=-1) - along * along
+        weight = confidence[valid] * torch.exp(-across2 / (h * h)) * torch.exp(-((along / (2 * h)) ** 2))
+        flat = (node[:, 0] * nodes + node[:, 1]) * nodes + node[:, 2]
+        sums.index_add_(0, flat, torch.stack([weight * along, weight], dim=-1))
+    weight = sums[:, 1]
+    distance = sums[:, 0] / weight.clamp(min=1e-6)
+    shape = (nodes, nodes, nodes)
+    return PointDistances(
+        distance=distance.reshape(shape), weight=torch.where(weight > 1e-3, weight, 0.0).reshape(shape)
+    )
+
+
+def _offsets(first: int, last: int, device: torch.device) -> Int[Tensor, "offsets 3"]:
+    steps = torch.arange(first, last + 1, device=device)
+    return torch.cartesian_prod(steps, steps, steps)
+
+
+def off_silhouette(
+    camera: Pinhole, distance_px: Float[Tensor, "height width"], nodes: int
+) -> Float[Tensor, "nodes nodes nodes"]:
+    """Distance of every node from the silhouette, in object units: > 0 off the subject, < 0 on it.
+
+    `distance_px` is the image's signed distance to the mask's outline; a node that the photograph does
+    not show gets minus infinity (it may be anything).
+    """
+    points = node_positions(nodes, distance_px.device)
+    pixel, depth = project(camera, points)
+    shown = inside(pixel, camera.width, camera.height) & (depth > 0)
+    flat = pixel.reshape(nodes, nodes * nodes, 2)
+    at = sample_image(distance_px[None], flat[None])[0, 0].reshape(shown.shape)
+    return torch.where(shown, at * depth / camera.intrinsics[0, 0], -torch.inf)
+
+
+def seen_through(
+    camera: Pinhole, depth_map: Float[Tensor, "height width"], margin: float, nodes: int
+) -> Bool[Tensor, "nodes nodes nodes"]:
+    """Nodes that lie in front of what the photograph measured, by more than `margin`."""
+    points = node_positions(nodes, depth_map.device)
+    pixel, depth = project(camera, points)
+    shown = inside(pixel, camera.width, camera.height) & (depth > 0)
+    flat = pixel.reshape(nodes, nodes * nodes, 2)
+    measured = sample_image(depth_map[None], flat[None], mode="nearest")[0, 0].reshape(shown.shape)
+    return shown & (measured > 0) & (depth < measured - margin)

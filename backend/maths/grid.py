@@ -1,0 +1,130 @@
+"""Functions on a regular grid over the cube [-1, 1]^3, and their gradients.
+
+A grid of N nodes per axis is a tensor [x, y, z, ...] whose node i lies at -1 + 2 i / (N - 1).
+Between nodes the function is trilinear. Its value and its gradient in space at a given point are
+both linear in the eight node values around, so that losses on gradients (eikonal, normals) need no
+second derivatives: one backward pass through a gather gives everything.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+
+@dataclass(frozen=True, kw_only=True)
+class Corners:
+    """Where points lie in a grid."""
+
+    index: Int[Tensor, "points 8"]
+    """Flat node numbers of each point's cell."""
+    weight: Float[Tensor, "points 8"]
+    """Trilinear weights; they sum to one."""
+    slope: Float[Tensor, "points 8 3"]
+    """Gradient of each weight in space; they sum to zero."""
+
+
+def spacing(nodes: int) -> float:
+    """Distance between neighbouring nodes."""
+    return 2.0 / (nodes - 1)
+
+
+def node_positions(nodes: int, device: torch.device) -> Float[Tensor, "nodes nodes nodes 3"]:
+    """Where the nodes lie."""
+    steps = torch.linspace(-1, 1, nodes, device=device)
+    return torch.stack(torch.meshgrid(steps, steps, steps, indexing="ij"), dim=-1)
+
+
+def locate(points: Float[Tensor, "points 3"], nodes: int) -> Corners:
+    """The cell of each point; points outside the cube are moved to its side."""
+    scaled = ((points + 1) * (0.5 * (nodes - 1))).clamp(0, nodes - 1 - 1e-4)
+    low = scaled.floor()
+    t = scaled - low
+    base = low.long()
+    flat = (base[:, 0] * nodes + base[:, 1]) * nodes + base[:, 2]
+    offsets = torch.tensor(
+        [(i * nodes + j) * nodes + k for i in (0, 1) for j in (0, 1) for k in (0, 1)], device=points.device
+    )
+    sides = torch.stack([1 - t, t], dim=1)  # (points, 2, 3)
+    x, y, z = sides.unbind(-1)
+    xy = x[:, :, None] * y[:, None, :]
+    weight = (xy[..., None] * z[:, None, None, :]).flatten(1)
+    sign = points.new_tensor([-1.0, 1.0]) * (0.5 * (nodes - 1))
+    slope_x = (sign[:, None, None] * (y[:, :, None] * z[:, None, :])[:, None]).flatten(1)
+    slope_y = (sign[:, None] * (x[:, :, None] * z[:, None, :])[:, :, None]).flatten(1)
+    slope_z = (xy[..., None] * sign).flatten(1)
+    return Corners(
+        index=flat[:, None] + offsets, weight=weight, slope=torch.stack([slope_x, slope_y, slope_z], dim=-1)
+    )
+
+
+def interpolate(grid: Float[Tensor, "nodes nodes nodes"], corners: Corners) -> Float[Tensor, "points"]:
+    """Value at each point."""
+    return (grid.reshape(-1)[corners.index] * corners.weight).sum(dim=-1)
+
+
+def value_and_gradient(
+    grid: Float[Tensor, "nodes nodes nodes"], corners: Corners
+) -> tuple[Float[Tensor, "points"], Float[Tensor, "points 3"]]:
+    """Value and spatial gradient at each point; both differentiable in the grid."""
+    values = grid.reshape(-1)[corners.index]
+    return (values * corners.weight).sum(dim=-1), torch.einsum("pc,pcd->pd", values, corners.slope)
+
+
+def interpolate_features(
+    grid: Float[Tensor, "cells channels"], corners: Corners
+) -> Float[Tensor, "points channels"]:
+    """Value of a grid with several channels, given as one row per node."""
+    return torch.einsum("pc,pcd->pd", corners.weight, grid[corners.index])
+
+
+def splat(
+    values: Float[Tensor, "points channels"], corners: Corners, nodes: int
+) -> Float[Tensor, "cells channels"]:
+    """Sum of the points' values at the nodes, by trilinear weight: the transpose of interpolation."""
+    out = values.new_zeros((nodes**3, values.shape[1]))
+    for corner in range(8):
+        out.index_add_(0, corners.index[:, corner], corners.weight[:, corner, None] * values)
+    return out
+
+
+def refined(grid: Float[Tensor, "coarse coarse coarse"], nodes: int) -> Float[Tensor, "nodes nodes nodes"]:
+    """The same function on a grid of another size (trilinear)."""
+    return F.interpolate(grid[None, None], size=(nodes, nodes, nodes), mode="trilinear", align_corners=True)[
+        0, 0
+    ]
+
+
+def laplacian(
+    grid: Float[Tensor, "nodes nodes nodes"],
+) -> Float[Tensor, "nodes nodes nodes"]:
+    """Sum of differences to the neighbours, in grid steps; symmetric: nothing flows through the sides."""
+    out = torch.zeros_like(grid)
+    for axis in range(3):
+        count = grid.shape[axis]
+        step = grid.narrow(axis, 1, count - 1) - grid.narrow(axis, 0, count - 1)
+        out.narrow(axis, 0, count - 1).add_(step)
+        out.narrow(axis, 1, count - 1).sub_(step)
+    return out
+
+
+def laplacian_at(
+    node_values: Callable[[Int[Tensor, "*batch"]], Float[Tensor, "*batch"]],
+    index: Int[Tensor, "chosen"],
+    nodes: int,
+) -> Float[Tensor, "chosen"]:
+    """The same at chosen inner nodes (flat numbers), for a function of flat node numbers."""
+    offsets = torch.tensor([0, 1, -1, nodes, -nodes, nodes * nodes, -nodes * nodes], device=index.device)
+    around = node_values((index[:, None] + offsets).clamp(0, nodes**3 - 1))
+    return around[:, 1:].sum(dim=-1) - 6 * around[:, 0]
+
+
+def near_surface(grid: Float[Tensor, "nodes nodes nodes"], cells: int) -> Bool[Tensor, "nodes nodes nodes"]:
+    """Nodes within `cells` steps (along the axes' boxes) of a change of sign."""
+    inside = (grid < 0).float()[None, None]
+    low = -F.max_pool3d(-inside, 2 * cells + 1, 1, cells)
+    high = F.max_pool3d(inside, 2 * cells + 1, 1, cells)
+    return (high != low)[0, 0]

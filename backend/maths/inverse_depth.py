@@ -1,0 +1,78 @@
+"""Depth maps as inverse depth, in which a plane of space is an affine function of the pixel.
+
+w(u, v) = 1 / z.  For the plane n . X = 1 in camera axes, w = n_x x + n_y y + n_z with
+x = (u - cx) / fx, y = (v - cy) / fy; so slopes of w give the normal in closed form.
+"""
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from .correlation import window_sum
+from .geometry import Pinhole, pixel_centres
+
+
+def fit_planes(
+    inverse_depth: Float[Tensor, "height width"], weight: Float[Tensor, "height width"], radius: int
+) -> Float[Tensor, "3 height width"]:
+    """Weighted least-squares plane around every pixel: (value at the pixel, slope in u, slope in v), per pixel.
+
+    A weak prior pulls the slopes to 0, so that windows with hardly any weight stay finite.
+    """
+    height, width = inverse_depth.shape
+    pixels = pixel_centres(width, height, inverse_depth.device)
+    u = pixels[..., 0] - width / 2
+    v = pixels[..., 1] - height / 2
+    w = inverse_depth * (weight > 0)
+    terms = torch.stack([weight, weight * u, weight * v, weight * w, weight * u * u, weight * u * v])
+    terms = torch.cat([terms, torch.stack([weight * v * v, weight * u * w, weight * v * w])]).double()
+    s = window_sum(terms, radius)
+    total = s[0].clamp(min=1e-9)
+    mean_u, mean_v, mean_w = s[1] / total, s[2] / total, s[3] / total
+    prior = 1e-2
+    uu = s[4] / total - mean_u**2 + prior
+    uv = s[5] / total - mean_u * mean_v
+    vv = s[6] / total - mean_v**2 + prior
+    uw = s[7] / total - mean_u * mean_w
+    vw = s[8] / total - mean_v * mean_w
+    determinant = uu * vv - uv * uv
+    slope_u = (vv * uw - uv * vw) / determinant
+    slope_v = (uu * vw - uv * uw) / determinant
+    value = mean_w + slope_u * (u - mean_u) + slope_v * (v - mean_v)
+    return torch.stack([value, slope_u, slope_v]).float()
+
+
+def normals_from_planes(
+    planes: Float[Tensor, "3 height width"], camera: Pinhole
+) -> Float[Tensor, "height width 3"]:
+    """Unit normals towards the camera, object frame, of planes from `fit_planes`."""
+    k = camera.intrinsics
+    pixels = pixel_centres(camera.width, camera.height, planes.device)
+    value, slope_u, slope_v = planes
+    n_x, n_y = slope_u * k[0, 0], slope_v * k[1, 1]
+    n_z = value - slope_u * (pixels[..., 0] - k[0, 2]) - slope_v * (pixels[..., 1] - k[1, 2])
+    # n . X = 1 > 0 for the point seen, so n points away from the camera
+    normal = -torch.stack([n_x, n_y, n_z], dim=-1)
+    normal = normal / normal.norm(dim=-1, keepdim=True).clamp(min=1e-12)
+    return normal @ camera.camera_from_object[:3, :3]
+
+
+def parabola_offset(
+    before: Float[Tensor, "*batch"], best: Float[Tensor, "*batch"], after: Float[Tensor, "*batch"]
+) -> Float[Tensor, "*batch"]:
+    """Where, in steps from the middle one, the parabola through three costs is lowest; within half a step."""
+    curvature = before - 2 * best + after
+    offset = 0.5 * (before - after) / torch.where(curvature > 1e-12, curvature, 1.0)
+    return torch.where(curvature > 1e-12, offset, 0.0).clamp(-0.5, 0.5)
+
+
+def lowest_with_neighbours(
+    cost: Float[Tensor, "*batch planes"],
+) -> tuple[Int[Tensor, "*batch"], Float[Tensor, "*batch"]]:
+    """Index of the lowest cost on the last axis, and the sub-step offset of its parabola."""
+    last = cost.shape[-1] - 1
+    index = cost.argmin(dim=-1)
+    around = torch.stack([(index - 1).clamp(min=0), index, (index + 1).clamp(max=last)], dim=-1)
+    before, best, after = cost.gather(-1, around).unbind(-1)
+    offset = parabola_offset(before, best, after)
+    return index, torch.where((index > 0) & (index < last), offset, 0.0)

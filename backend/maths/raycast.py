@@ -1,0 +1,222 @@
+"""Rays against triangle meshes: the first hit, pictures of a mesh, and which camera sees a point.
+
+All positions are in one frame, the world's; a ray is `origin + distance * direction` with a unit
+direction, so that a distance is a length. Intel Embree finds the triangle in single precision; the
+distance and the place inside the triangle are then computed in double precision from that triangle.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from embreex.mesh_construction import TriangleMesh
+from embreex.rtcore_scene import EmbreeScene
+from jaxtyping import Bool, Float, Float32, Float64, Int, Int64
+
+from ..scene import Camera, SurfaceMesh, transform_points
+
+GRAZING_COSINE = 0.05
+"""A surface seen at a smaller cosine (87 degrees off its normal) shows too few pixels to count as seen."""
+
+SELF_HIT_OFFSET = 2e-3
+"""How far a point is lifted off the surface before asking what covers it, in diagonals of the mesh's box:
+above the sag of a triangle under its vertex normals, below any detail a few photographs can resolve."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RayHits:
+    """Where rays first meet a mesh."""
+
+    distance: Float64[np.ndarray, "rays"]
+    """Along the unit direction, world units; infinite where missed."""
+    face: Int64[np.ndarray, "rays"]
+    """-1 where missed."""
+    barycentric: Float64[np.ndarray, "rays 3"]
+    """Weights of the face's three corners, summing to 1; 0 where missed."""
+
+    @property
+    def hit(self) -> Bool[np.ndarray, "rays"]:
+        """True where the ray meets the mesh."""
+        return self.face >= 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class MeshImage:
+    """A mesh as a camera sees it, without light or shading."""
+
+    colour_srgb: Float32[np.ndarray, "height width 3"]
+    """Interpolated vertex colours; 0 where not covered."""
+    coverage: Bool[np.ndarray, "height width"]
+    """True where the pixel's centre shows the mesh."""
+    depth: Float32[np.ndarray, "height width"]
+    """Along the optical axis, world units; infinite where not covered."""
+    normal_world: Float32[np.ndarray, "height width 3"]
+    """Unit, interpolated vertex normals; 0 where not covered."""
+    support: Float32[np.ndarray, "height width"]
+    """0 where not covered."""
+
+
+class RayCaster:
+    """A triangle mesh prepared for many batches of rays."""
+
+    def __init__(self, vertices: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "faces 3"]) -> None:
+        self.vertices: Float64[np.ndarray, "vertices 3"] = np.asarray(vertices, np.float64)
+        self.faces: Int64[np.ndarray, "faces 3"] = np.asarray(faces, np.int64)
+        used = self.vertices[self.faces.ravel()] if self.faces.size else np.zeros((1, 3))
+        self._centre = (used.min(0) + used.max(0)) / 2
+        self.diagonal = float(np.linalg.norm(np.ptp(used, axis=0)))
+        """Of the mesh's bounding box, world units."""
+        # Single precision resolves a mesh of size 1 at the origin best, whatever the world's units.
+        self._scale = 1.0 / self.diagonal if self.diagonal > 0 else 1.0
+        # Without `robust`, one in eight rays aimed exactly at a shared edge slips through; with it, none.
+        self._scene = EmbreeScene(robust=True)
+        TriangleMesh(self._scene, self._single(self.vertices), self.faces.astype(np.int32))
+
+    def cast(self, origins: Float[np.ndarray, "rays 3"], directions: Float[np.ndarray, "rays 3"]) -> RayHits:
+        """First hit of each ray, from either side of a face; `directions` are of unit length."""
+        distance, barycentric = np.full(len(origins), np.inf), np.zeros((len(origins), 3))
+        face = self._scene.run(self._single(origins), _contiguous(directions)).astype(np.int64)
+        hit = face >= 0
+        corners = self.vertices[self.faces[face[hit]]]
+        distance[hit], barycentric[hit] = intersect_planes(corners, origins[hit], directions[hit])
+        return RayHits(distance=distance, face=face, barycentric=barycentric)
+
+    def blocked(
+        self,
+        origins: Float[np.ndarray, "rays 3"],
+        directions: Float[np.ndarray, "rays 3"],
+        reach: Float[np.ndarray, "rays"],
+    ) -> Bool[np.ndarray, "rays"]:
+        """True where something lies on the ray nearer than `reach` (world units, unit directions)."""
+        lengths = np.ascontiguousarray(reach * self._scale, np.float32)
+        run = self._scene.run(self._single(origins), _contiguous(directions), dists=lengths, query="OCCLUDED")
+        return np.asarray(run >= 0)
+
+    def _single(self, points: Float[np.ndarray, "points 3"]) -> Float32[np.ndarray, "points 3"]:
+        return _contiguous((points - self._centre) * self._scale)
+
+
+def _contiguous(array: Float[np.ndarray, "rows 3"]) -> Float32[np.ndarray, "rows 3"]:
+    return np.ascontiguousarray(array, np.float32)
+
+
+def intersect_planes(
+    corners: Float[np.ndarray, "rays 3 3"],
+    origins: Float[np.ndarray, "rays 3"],
+    directions: Float[np.ndarray, "rays 3"],
+) -> tuple[Float[np.ndarray, "rays"], Float[np.ndarray, "rays 3"]]:
+    """Distance to each ray's own triangle and the weights of its corners there.
+
+    Moeller and Trumbore, "Fast, minimum storage ray/triangle intersection" (1997), equation 6, for rays
+    known to hit; weights are clamped to the triangle, because a hit on an edge may fall outside by rounding.
+    """
+    edge1, edge2 = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    offset = origins - corners[:, 0]
+    across, along = np.cross(directions, edge2), np.cross(offset, edge1)
+    determinant = _dot(edge1, across)
+    flat = determinant == 0
+    inverse = 1.0 / np.where(flat, 1.0, determinant)
+    distance = _dot(edge2, along) * inverse
+    u, v = _dot(offset, across) * inverse, _dot(directions, along) * inverse
+    weights = np.clip(np.stack([1.0 - u - v, u, v], -1), 0.0, 1.0)
+    weights /= weights.sum(-1, keepdims=True)
+    # A ray within a triangle's plane meets it in a segment: its nearest corner stands for it.
+    weights[flat] = [1.0, 0.0, 0.0]
+    return np.where(flat, -_dot(offset, directions), distance), weights
+
+
+def _dot(a: Float[np.ndarray, "rays 3"], b: Float[np.ndarray, "rays 3"]) -> Float64[np.ndarray, "rays"]:
+    return np.asarray(np.einsum("rd,rd->r", a, b), np.float64)  # three times as fast as (a * b).sum(-1)
+
+
+def cast_rays(
+    vertices: Float[np.ndarray, "vertices 3"],
+    faces: Int[np.ndarray, "faces 3"],
+    origins: Float[np.ndarray, "rays 3"],
+    directions: Float[np.ndarray, "rays 3"],
+) -> RayHits:
+    """First hits of one batch; for several batches on one mesh keep a RayCaster."""
+    return RayCaster(vertices, faces).cast(origins, directions)
+
+
+def camera_rays(
+    camera: Camera,
+) -> tuple[Float64[np.ndarray, "pixels 3"], Float64[np.ndarray, "pixels 3"]]:
+    """Origin and unit direction, world frame, through every pixel's centre, row by row."""
+    x = (np.arange(camera.width) + 0.5 - camera.cx_px) / camera.fx_px
+    y = (np.arange(camera.height) + 0.5 - camera.cy_px) / camera.fy_px
+    grid = np.stack([*np.meshgrid(x, y), np.ones((camera.height, camera.width))], -1).reshape(-1, 3)
+    directions = grid @ camera.camera_from_world[:3, :3]
+    directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
+    return np.broadcast_to(camera.position, directions.shape), directions
+
+
+def render_mesh(mesh: SurfaceMesh, camera: Camera, *, caster: RayCaster | None = None) -> MeshImage:
+    """The mesh's own colours, normals and support at every pixel's centre of a camera.
+
+    `caster` is one built from this mesh, to draw it from several cameras.
+    """
+    origins, directions = camera_rays(camera)
+    hits = (caster or RayCaster(mesh.vertices, mesh.faces)).cast(origins, directions)
+    hit, shape = hits.hit, (camera.height, camera.width)
+    corners, weights = mesh.faces[hits.face[hit]], hits.barycentric[hit]
+
+    def picture(
+        values: Float[np.ndarray, "covered *channels"],
+    ) -> Float32[np.ndarray, "height width *channels"]:
+        image = np.zeros((len(hit), *values.shape[1:]), np.float32)
+        image[hit] = values
+        return image.reshape(*shape, *values.shape[1:])
+
+    normals = interpolate(mesh.normals, corners, weights)
+    lengths = np.linalg.norm(normals, axis=-1, keepdims=True)
+    depth = np.full(len(hit), np.inf, np.float32)
+    depth[hit] = (hits.distance[hit, None] * directions[hit]) @ camera.camera_from_world[2, :3]
+    return MeshImage(
+        colour_srgb=picture(interpolate(mesh.colours_srgb, corners, weights) / 255.0),
+        coverage=hit.reshape(shape),
+        depth=depth.reshape(shape),
+        normal_world=picture(normals / np.where(lengths > 0, lengths, 1.0)),
+        support=picture(interpolate(mesh.support, corners, weights)),
+    )
+
+
+def interpolate(
+    values: np.ndarray, corners: Int64[np.ndarray, "hits 3"], weights: Float64[np.ndarray, "hits 3"]
+) -> np.ndarray:
+    """Values of the vertices, of any shape, mixed by the weights of each hit's three corners."""
+    return np.asarray(np.einsum("hk,hk...->h...", weights, values[corners].astype(np.float64)))
+
+
+def visible_from(
+    points: Float[np.ndarray, "points 3"],
+    normals: Float[np.ndarray, "points 3"],
+    cameras: Sequence[Camera],
+    caster: RayCaster,
+) -> Bool[np.ndarray, "points cameras"]:
+    """True where a camera sees a point of the caster's surface: in its picture, facing it, and not covered.
+
+    `normals` are unit, outwards. Points and their mesh may differ slightly (samples, vertices).
+    """
+    seen = np.zeros((len(points), len(cameras)), bool)
+    lifted = points + SELF_HIT_OFFSET * caster.diagonal * normals
+    for column, camera in enumerate(cameras):
+        towards = camera.position - points
+        facing = _dot(towards, normals) > GRAZING_COSINE * np.linalg.norm(towards, axis=-1)
+        candidates = np.flatnonzero(facing & in_picture(points, camera))
+        # From the lifted point, so that a camera nearer than what lies behind it is not hidden by that.
+        ray = camera.position - lifted[candidates]
+        reach = np.linalg.norm(ray, axis=-1)
+        covered = caster.blocked(lifted[candidates], ray / reach[:, None], reach)
+        seen[candidates[~covered], column] = True
+    return seen
+
+
+def in_picture(points: Float[np.ndarray, "points 3"], camera: Camera) -> Bool[np.ndarray, "points"]:
+    """True where a point lies in front of the camera and within its picture's edges."""
+    x, y, z = transform_points(camera.camera_from_world, points).T
+    front = z > 0
+    depth = np.where(front, z, 1.0)
+    column, row = camera.fx_px * x / depth + camera.cx_px, camera.fy_px * y / depth + camera.cy_px
+    inside = (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
+    return np.asarray(front & inside)

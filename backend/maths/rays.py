@@ -1,0 +1,59 @@
+"""Searching rays for the surface of a distance field."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+DistanceFunction = Callable[[Float[Tensor, "points 3"]], Float[Tensor, "points"]]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Crossing:
+    """Where rays meet the surface, or come nearest to it."""
+
+    along: Float[Tensor, "rays"]
+    """Distance from the origin."""
+    hit: Bool[Tensor, "rays"]
+
+
+def sphere_entry(
+    origins: Float[Tensor, "rays 3"], directions: Float[Tensor, "rays 3"]
+) -> Float[Tensor, "rays"]:
+    """Where rays enter the unit sphere; 0 if they start inside; the nearest point if they miss it."""
+    middle = -(origins * directions).sum(dim=-1)
+    half_squared = 1 - (origins + middle[:, None] * directions).square().sum(dim=-1)
+    return (middle - half_squared.clamp(min=0).sqrt()).clamp(min=0)
+
+
+def first_crossing(
+    distance: DistanceFunction,
+    origins: Float[Tensor, "rays 3"],
+    directions: Float[Tensor, "rays 3"],
+    start: Float[Tensor, "rays"],
+    *,
+    shortest: float = 0.005,
+    steps: int = 40,
+) -> Crossing:
+    """Sphere tracing from `start`, at least `shortest` a step; the crossing by the secant.
+
+    A ray that never meets the surface gets the place where it came nearest, so that the silhouette
+    can be moved towards or away from it. Rays end 2 units after their start (the region's width).
+    """
+    along = start.clone()
+    before_along, before = along, torch.full_like(along, torch.inf)
+    nearest, nearest_along = torch.full_like(along, torch.inf), along.clone()
+    crossing, hit = along.clone(), torch.zeros_like(along, dtype=torch.bool)
+    for _ in range(steps):
+        here = distance(origins + along[:, None] * directions)
+        closer = (here < nearest) & ~hit
+        nearest, nearest_along = torch.where(closer, here, nearest), torch.where(closer, along, nearest_along)
+        new = (here <= 0) & ~hit
+        share = torch.where(before.isfinite(), before / (before - here).clamp(min=1e-9), 1.0)
+        crossing = torch.where(new, before_along + share * (along - before_along), crossing)
+        hit = hit | new
+        before_along, before = along, here
+        along = (along + (0.95 * here).clamp(min=shortest)).minimum(start + 2.0)
+    return Crossing(along=torch.where(hit, crossing, nearest_along), hit=hit)

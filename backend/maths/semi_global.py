@@ -1,0 +1,40 @@
+"""Semi-global matching: smooth depth through weak texture, sharp at edges.
+
+After Hirschmueller, "Stereo processing by semiglobal matching and mutual information" (PAMI 2008):
+along each scan line the cost of a plane is its own plus the cheapest way to come from the pixel
+before, where a step of one plane costs `small_step` and any other `large_step`.
+"""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+
+def aggregate(
+    cost: Float[Tensor, "height width planes"], small_step: float, large_step: Float[Tensor, "height width"]
+) -> Float[Tensor, "height width planes"]:
+    """Sum of the path costs along four directions; lowest at the plane to choose.
+
+    `large_step` may vary over the image (cheaper across its edges).
+    """
+    total = _scan_rows(cost, small_step, large_step)
+    total += _scan_rows(cost.flip(0), small_step, large_step.flip(0)).flip(0)
+    across, step_across = cost.transpose(0, 1).contiguous(), large_step.T.contiguous()
+    total += _scan_rows(across, small_step, step_across).transpose(0, 1)
+    total += _scan_rows(across.flip(0), small_step, step_across.flip(0)).flip(0).transpose(0, 1)
+    return total
+
+
+def _scan_rows(
+    cost: Float[Tensor, "steps lines planes"], small_step: float, large_step: Float[Tensor, "steps lines"]
+) -> Float[Tensor, "steps lines planes"]:
+    """Path costs of scan lines that run along the first axis; kept bounded by subtracting each step's best."""
+    path = cost.clone()
+    for step in range(1, len(cost)):
+        before = path[step - 1]
+        before = before - before.min(dim=-1, keepdim=True).values
+        come = torch.minimum(before, large_step[step][:, None])
+        torch.minimum(come[:, 1:], before[:, :-1] + small_step, out=come[:, 1:])
+        torch.minimum(come[:, :-1], before[:, 1:] + small_step, out=come[:, :-1])
+        path[step] += come
+    return path

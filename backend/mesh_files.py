@@ -1,0 +1,184 @@
+"""Meshes and points as files: PLY with everything a vertex carries, glTF for every other program.
+
+The same record gives the same bytes. Both are written here rather than by trimesh, which drops
+attributes of its own choosing from a PLY and stores glTF colours in 8 bits, where linear light needs 16.
+Positions in a PLY are doubles: given cameras may live in map coordinates, far from the origin.
+"""
+
+import json
+import struct
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, UInt8, UInt16
+
+from .scene import Region, SurfaceMesh, SurfacePoints, transform_points
+
+_POINT_FIELDS = [(axis, "<f8") for axis in ("x", "y", "z")] + [(axis, "<f4") for axis in ("nx", "ny", "nz")]
+_COLOUR_FIELDS = [(channel, "u1") for channel in ("red", "green", "blue")]
+_MESH_VERTEX = np.dtype([*_POINT_FIELDS, *_COLOUR_FIELDS, ("support", "<f4")])
+_CLOUD_VERTEX = np.dtype([*_POINT_FIELDS, *_COLOUR_FIELDS, ("confidence", "<f4")])
+_FACE = np.dtype([("num_corners", "u1"), ("corners", "<i4", (3,))])
+_PLY_NAMES = {"<f8": "double", "<f4": "float", "|u1": "uchar"}
+
+_Y_UP_FROM_Z_UP = np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]], np.float64)
+"""glTF has y up; the world of given cameras has z up by convention, so that Blender turns it back."""
+_GLTF_FLOAT, _GLTF_USHORT, _GLTF_UINT = 5126, 5123, 5125
+_GLTF_VERTICES, _GLTF_INDICES = 34962, 34963
+
+
+class MeshFileError(ValueError):
+    """A file that is not a mesh as `mesh_bytes` writes it."""
+
+
+def write_mesh(path: Path, mesh: SurfaceMesh) -> None:
+    """Write mesh.ply: binary PLY with normals, colours and `support` at each vertex."""
+    vertices = _vertex_table(_MESH_VERTEX, mesh.vertices, mesh.normals, mesh.colours_srgb)
+    vertices["support"] = mesh.support
+    faces = np.zeros(len(mesh.faces), _FACE)
+    faces["num_corners"] = 3
+    faces["corners"] = mesh.faces
+    header = _header(vertices, num_faces=len(faces))
+    path.write_bytes(header + vertices.tobytes() + faces.tobytes())
+
+
+def read_mesh(path: Path) -> SurfaceMesh:
+    """The mesh of a file written by write_mesh, without its decisions; MeshFileError for any other file."""
+    header, _, body = path.read_bytes().partition(b"end_header\n")
+    num_vertices, num_faces = _counts(header)
+    faces_start = num_vertices * _MESH_VERTEX.itemsize
+    if len(body) != faces_start + num_faces * _FACE.itemsize:
+        raise MeshFileError(f"{path.name} is cut short or has other properties than a FewView mesh")
+    vertices = np.frombuffer(body, _MESH_VERTEX, num_vertices)
+    if header + b"end_header\n" != _header(vertices, num_faces=num_faces):
+        raise MeshFileError(f"{path.name} has other properties than a FewView mesh")
+    return SurfaceMesh(
+        vertices=np.stack([vertices[axis] for axis in ("x", "y", "z")], axis=-1).astype(np.float64),
+        faces=np.frombuffer(body, _FACE, num_faces, faces_start)["corners"].astype(np.int64),
+        normals=np.stack([vertices[axis] for axis in ("nx", "ny", "nz")], axis=-1).astype(np.float32),
+        colours_srgb=np.stack([vertices[name] for name, _ in _COLOUR_FIELDS], axis=-1),
+        support=vertices["support"].astype(np.float32),
+    )
+
+
+def write_points(path: Path, points: SurfacePoints, region: Region) -> None:
+    """Write points.ply: the points in the world frame with normals, colours and `confidence`."""
+    rotation = region.world_from_object[:3, :3] / region.radius_world
+    table = _vertex_table(
+        _CLOUD_VERTEX,
+        transform_points(region.world_from_object, points.positions.astype(np.float64)),
+        (points.normals @ rotation.T).astype(np.float32),
+        np.round(points.colours_srgb.clip(0.0, 1.0) * 255).astype(np.uint8),
+    )
+    table["confidence"] = points.confidence
+    path.write_bytes(_header(table, num_faces=None) + table.tobytes())
+
+
+def write_glb(path: Path, mesh: SurfaceMesh) -> None:
+    """Write a binary glTF 2.0: y up, linear vertex colours, the custom attribute `_SUPPORT`."""
+    positions = (mesh.vertices @ _Y_UP_FROM_Z_UP.T).astype("<f4")
+    attributes = {
+        "POSITION": positions,
+        "NORMAL": (mesh.normals @ _Y_UP_FROM_Z_UP.T).astype("<f4"),
+        "COLOR_0": _linear_rgba(mesh.colours_srgb).astype("<u2"),
+        "_SUPPORT": mesh.support.astype("<f4"),
+    }
+    corners = mesh.faces.astype("<u4").ravel()
+    binary = b"".join(array.tobytes() for array in (*attributes.values(), corners))
+    structure = json.dumps(_gltf(attributes, corners), separators=(",", ":")).encode()
+    structure += b" " * (-len(structure) % 4)
+    size = 12 + 8 + len(structure) + 8 + len(binary)
+    path.write_bytes(
+        struct.pack("<4sII", b"glTF", 2, size)
+        + struct.pack("<I4s", len(structure), b"JSON")
+        + structure
+        + struct.pack("<I4s", len(binary), b"BIN\0")
+        + binary
+    )
+
+
+def _vertex_table(
+    layout: np.dtype[np.void],
+    positions: Float[np.ndarray, "vertices 3"],
+    normals: Float[np.ndarray, "vertices 3"],
+    colours_srgb: UInt8[np.ndarray, "vertices 3"],
+) -> np.ndarray:
+    """A structured array of the layout, its last field still 0."""
+    table = np.zeros(len(positions), layout)
+    columns = np.hsplit(positions, 3) + np.hsplit(normals, 3) + np.hsplit(colours_srgb, 3)
+    for name, column in zip(layout.names or (), columns, strict=False):
+        table[name] = column[:, 0]
+    return table
+
+
+def _header(table: np.ndarray, *, num_faces: int | None) -> bytes:
+    """PLY header of a vertex table, and of triangles after it unless num_faces is None."""
+    lines = ["ply", "format binary_little_endian 1.0", "comment FewView", f"element vertex {len(table)}"]
+    for name in table.dtype.names or ():
+        lines.append(f"property {_PLY_NAMES[table.dtype[name].str]} {name}")
+    if num_faces is not None:
+        lines += [f"element face {num_faces}", "property list uchar int vertex_indices"]
+    return "\n".join([*lines, "end_header\n"]).encode("ascii")
+
+
+def _counts(header: bytes) -> tuple[int, int]:
+    """Numbers of vertices and faces that a PLY header declares."""
+    counts = {"vertex": -1, "face": -1}
+    for line in header.split(b"\n"):
+        words = line.decode("ascii", "replace").split()
+        if len(words) == 3 and words[0] == "element" and words[1] in counts and words[2].isdecimal():
+            counts[words[1]] = int(words[2])
+    if min(counts.values()) < 0:
+        raise MeshFileError("not a PLY file with vertices and faces")
+    return counts["vertex"], counts["face"]
+
+
+def _linear_rgba(colours_srgb: UInt8[np.ndarray, "vertices 3"]) -> UInt16[np.ndarray, "vertices 4"]:
+    """Linear light, 65535 = 1, opaque: glTF's COLOR_0 is linear (IEC 61966-2-1 decoding)."""
+    steps = np.arange(256) / 255.0
+    linear = np.where(steps <= 0.04045, steps / 12.92, ((steps + 0.055) / 1.055) ** 2.4)
+    rgba = np.full((len(colours_srgb), 4), 65535, np.uint16)
+    rgba[:, :3] = np.round(linear * 65535).astype(np.uint16)[colours_srgb]
+    return rgba
+
+
+def _gltf(attributes: dict[str, np.ndarray], corners: np.ndarray) -> dict[str, object]:
+    """The JSON part of the file; the arrays follow each other in the binary part."""
+    types = {"<f4": _GLTF_FLOAT, "<u2": _GLTF_USHORT, "<u4": _GLTF_UINT}
+    accessors: list[dict[str, object]] = []
+    views: list[dict[str, object]] = []
+    offset = 0
+    for name, array in (*attributes.items(), ("indices", corners)):
+        target = _GLTF_INDICES if name == "indices" else _GLTF_VERTICES
+        views.append({"buffer": 0, "byteOffset": offset, "byteLength": array.nbytes, "target": target})
+        shape = "SCALAR" if array.ndim == 1 else f"VEC{array.shape[1]}"
+        kind = types[array.dtype.str]
+        accessor = {
+            "bufferView": len(accessors),
+            "componentType": kind,
+            "count": len(array),
+            "type": shape,
+        }
+        if kind == _GLTF_USHORT:
+            accessor["normalized"] = True
+        if name == "POSITION" and len(array):  # the format demands the bounds of positions
+            accessor |= {"min": array.min(axis=0).tolist(), "max": array.max(axis=0).tolist()}
+        accessors.append(accessor)
+        offset += array.nbytes
+    primitive = {
+        "attributes": {name: index for index, name in enumerate(attributes)},
+        "indices": len(attributes),
+        "material": 0,
+    }
+    surface = {"metallicFactor": 0.0, "roughnessFactor": 1.0}
+    return {
+        "asset": {"version": "2.0", "generator": "FewView"},
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0, "name": "FewView"}],
+        "meshes": [{"name": "FewView", "primitives": [primitive]}],
+        "materials": [{"pbrMetallicRoughness": surface, "doubleSided": True}],
+        "accessors": accessors,
+        "bufferViews": views,
+        "buffers": [{"byteLength": offset}],
+    }

@@ -1,0 +1,175 @@
+"""The frozen records that pass between stages.
+
+Conventions (docs/conventions.md): camera axes x right, y down, z forward; transforms are called
+`b_from_a` and are 4x4 float64; the centre of the top left pixel is (0.5, 0.5); images are float32
+in [0, 1], indexed [row, column].
+Frames: `world` is the frame of the given or solved cameras, in which results leave; `object` has
+the subject inside the unit sphere.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool, Float, Float32, Float64, Int64, UInt8
+
+Progress = Callable[[float, str], None]
+"""Called with the share of the stage that is done (0 to 1) and a few words; may raise Cancelled."""
+
+
+def no_progress(_fraction: float, _text: str) -> None:
+    """A progress callback that shows nothing and never cancels."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Decision:
+    """Something modelled or left out, and the measurement that decided it; shown in the report."""
+
+    what: str
+    choice: str
+    because: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class Photo:
+    """A photograph, upright, at working size, before its camera is known."""
+
+    name: str
+    """File name, unique in the job."""
+    path: Path
+    image_srgb: Float32[np.ndarray, "height width 3"]
+    mask: Float32[np.ndarray, "height width"] | None
+    """1 on the subject, 0 off it; None where nothing is known."""
+    original_width: int
+    """Upright, before scaling down, in pixels."""
+    original_height: int
+    focal_px: float | None
+    """Focal length in pixels of the original size, from EXIF; None where there is none."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Camera:
+    """A pinhole camera."""
+
+    camera_from_world: Float64[np.ndarray, "4 4"]
+    fx_px: float
+    fy_px: float
+    cx_px: float
+    cy_px: float
+    width: int
+    height: int
+
+    @property
+    def intrinsics(self) -> Float64[np.ndarray, "3 3"]:
+        """Calibration matrix K: pixel = K @ point_in_camera, up to scale."""
+        return np.array([[self.fx_px, 0, self.cx_px], [0, self.fy_px, self.cy_px], [0, 0, 1]], np.float64)
+
+    @property
+    def position(self) -> Float64[np.ndarray, "3"]:
+        """Centre of projection, world frame."""
+        rotation = self.camera_from_world[:3, :3]
+        centre: Float64[np.ndarray, "3"] = -rotation.T @ self.camera_from_world[:3, 3]
+        return centre
+
+    def resized(self, width: int, height: int) -> "Camera":
+        """The same camera over an image of another size."""
+        sx, sy = width / self.width, height / self.height
+        return replace(
+            self,
+            fx_px=self.fx_px * sx,
+            cx_px=self.cx_px * sx,
+            fy_px=self.fy_px * sy,
+            cy_px=self.cy_px * sy,
+            width=width,
+            height=height,
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class View:
+    """An undistorted photograph with its camera; image, mask and camera agree in size."""
+
+    name: str
+    camera: Camera
+    image_srgb: Float32[np.ndarray, "height width 3"]
+    mask: Float32[np.ndarray, "height width"] | None
+
+
+@dataclass(frozen=True, kw_only=True)
+class SolvedCameras:
+    """What the camera stage found."""
+
+    views: tuple[View, ...]
+    unplaced: tuple[str, ...]
+    """Names of photographs without a camera."""
+    estimated: bool
+    """False where the cameras were given."""
+    sparse_positions: Float64[np.ndarray, "points 3"]
+    """Triangulated features, world frame; empty where the cameras were given without any."""
+    sparse_visibility: Bool[np.ndarray, "points views"]
+    reprojection_error_px: float | None
+    """Mean over the sparse points, in pixels of the photographs as placed; None where not estimated."""
+    decisions: tuple[Decision, ...] = ()
+
+
+@dataclass(frozen=True, kw_only=True)
+class Region:
+    """The part of the world to reconstruct: the sphere that `object_from_world` maps to the unit sphere."""
+
+    object_from_world: Float64[np.ndarray, "4 4"]
+    """A similarity: uniform scale, rotation, translation."""
+    decisions: tuple[Decision, ...] = ()
+
+    @property
+    def world_from_object(self) -> Float64[np.ndarray, "4 4"]:
+        """Inverse of object_from_world."""
+        return np.linalg.inv(self.object_from_world)
+
+    @property
+    def centre_world(self) -> Float64[np.ndarray, "3"]:
+        """Centre of the sphere, world frame."""
+        return self.world_from_object[:3, 3]
+
+    @property
+    def radius_world(self) -> float:
+        """Radius of the sphere, world units."""
+        return float(np.cbrt(np.linalg.det(self.world_from_object[:3, :3])))
+
+
+@dataclass(frozen=True, kw_only=True)
+class SurfacePoints:
+    """Points on the surface as stereo saw them, object frame."""
+
+    positions: Float32[np.ndarray, "points 3"]
+    normals: Float32[np.ndarray, "points 3"]
+    """Unit, pointing out of the object."""
+    colours_srgb: Float32[np.ndarray, "points 3"]
+    confidence: Float32[np.ndarray, "points"]
+    """0 to 1."""
+    num_views: Int64[np.ndarray, "points"]
+    """Photographs that agree on the point, at least 2."""
+    view_index: Int64[np.ndarray, "points"]
+    """The photograph whose depth map the point comes from."""
+    decisions: tuple[Decision, ...] = ()
+
+
+@dataclass(frozen=True, kw_only=True)
+class SurfaceMesh:
+    """A triangle mesh, world frame; faces are counter-clockwise seen from outside."""
+
+    vertices: Float64[np.ndarray, "vertices 3"]
+    faces: Int64[np.ndarray, "faces 3"]
+    normals: Float32[np.ndarray, "vertices 3"]
+    colours_srgb: UInt8[np.ndarray, "vertices 3"]
+    support: Float32[np.ndarray, "vertices"]
+    """How well the photographs back the vertex: 0 seen by none, a guess; 1 seen and measured by several."""
+    decisions: tuple[Decision, ...] = ()
+
+
+def transform_points(
+    b_from_a: Float[np.ndarray, "4 4"], points: Float[np.ndarray, "*batch 3"]
+) -> Float[np.ndarray, "*batch 3"]:
+    """Points given in frame a, in frame b."""
+    transformed: Float[np.ndarray, "*batch 3"] = points @ b_from_a[:3, :3].T + b_from_a[:3, 3]
+    return transformed

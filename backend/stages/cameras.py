@@ -1,0 +1,67 @@
+"""Second stage: where each photograph was taken, and the photographs without their lens distortion."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from ..errors import ErrorCode, ReconstructionError
+from ..scene import Photo, Progress, SolvedCameras
+from .known_cameras import read_placement
+from .lenses import undistorted_view
+from .structure_from_motion import estimate_placement
+
+
+@dataclass(frozen=True, kw_only=True)
+class CamerasConfig:
+    """How much of the photographs is looked at to place the cameras."""
+
+    sfm_max_side_px: int = 1600
+    """Features are found on photographs scaled down until their longer side is this."""
+    max_features: int = 8192
+    """Per photograph; fewer where there are many photographs."""
+
+
+def solve_cameras(
+    photos: Sequence[Photo],
+    given: Path | None,
+    config: CamerasConfig,
+    *,
+    workdir: Path,
+    seed: int,
+    progress: Progress,
+) -> SolvedCameras:
+    """Cameras read from `given` or, without it, found from the photographs, and the undistorted views.
+
+    `given` is a nerfstudio transforms.json, a COLMAP model, or a folder with one of them.
+    Files are written to workdir alone. The same seed gives the same cameras to the bit.
+    Raises ReconstructionError: CAMERAS_UNUSABLE, NO_OVERLAP, NO_PARALLAX, TOO_FEW_PLACED.
+    """
+    if given is not None:
+        placement = read_placement(photos, given)
+    else:
+        placement = estimate_placement(
+            photos,
+            max_side_px=config.sfm_max_side_px,
+            max_features=config.max_features,
+            workdir=workdir,
+            seed=seed,
+            progress=lambda share, text: progress(0.9 * share, text),
+        )
+    if len(placement.placed) < 2:
+        text = f"Only {len(placement.placed)} of {len(photos)} photographs has a camera."
+        remedy = "Give cameras for at least two of the photographs, by file name."
+        raise ReconstructionError(ErrorCode.TOO_FEW_PLACED, text, remedy)
+    views = []
+    for number, placed in enumerate(placement.placed):
+        progress(0.9 + 0.1 * number / len(placement.placed), "Removing lens distortion")
+        views.append(undistorted_view(photos[placed.index], placed))
+    seen = {placed.index for placed in placement.placed}
+    return SolvedCameras(
+        views=tuple(views),
+        unplaced=tuple(photo.name for index, photo in enumerate(photos) if index not in seen),
+        estimated=given is None,
+        sparse_positions=placement.sparse_positions,
+        sparse_visibility=placement.sparse_visibility,
+        reprojection_error_px=placement.reprojection_error_px,
+        decisions=placement.decisions,
+    )

@@ -1,0 +1,171 @@
+"""Cameras that are given: nerfstudio's transforms.json, or a COLMAP model, matched to the photographs."""
+
+from collections.abc import Sequence
+from pathlib import Path, PurePosixPath
+
+import numpy as np
+import PIL.Image  # noqa: F401 - pycolmap loaded before Pillow corrupts memory when Pillow next saves
+import pycolmap
+from jaxtyping import Float64
+
+from ..errors import ErrorCode, ReconstructionError
+from ..images import same_shape
+from ..scene import Photo
+from .lenses import PlacedPhoto, Placement, rigid_matrix, sparse_points
+from .nerfstudio import camera_from_world, frame_lens, read_frames
+
+_ROTATION_TOLERANCE = 5e-3
+"""Poses are often written with few digits; nearer than this they are made exact."""
+
+_CHECK = "Check that the cameras belong to these photographs."
+
+
+def read_placement(photos: Sequence[Photo], given: Path) -> Placement:
+    """The cameras in a transforms.json, a COLMAP model folder, or a folder that has one of them.
+
+    Cameras and photographs are matched by file name; photographs without a camera are not placed.
+    Raises ReconstructionError(CAMERAS_UNUSABLE).
+    """
+    source = _find_source(given)
+    return _from_model(photos, source) if source.is_dir() else _from_transforms(photos, source)
+
+
+def match_by_name(photo_paths: Sequence[str], camera_paths: Sequence[str]) -> dict[int, int]:
+    """Index of the camera for each photograph that has one.
+
+    The file name decides, whatever its letter case and, where nothing fits better, its extension; where
+    cameras in several folders have it, the folders decide. Raises ReconstructionError(CAMERAS_UNUSABLE)
+    where they do not.
+    """
+    fits = {
+        (photo, camera): _likeness(photo_path, camera_path)
+        for photo, photo_path in enumerate(photo_paths)
+        for camera, camera_path in enumerate(camera_paths)
+    }
+    matched: dict[int, int] = {}
+    for (photo, camera), fit in sorted(fits.items(), key=lambda item: (-item[1], item[0])):
+        if fit == 0 or photo in matched or camera in matched.values():
+            continue
+        rivals = [c for c in range(len(camera_paths)) if c not in matched.values() and fits[photo, c] == fit]
+        if len(rivals) > 1:
+            name = PurePosixPath(photo_paths[photo]).name
+            text = f"{len(rivals)} of the cameras could be that of {name}."
+            raise _unusable(text, "Give each photograph a name of its own.")
+        matched[photo] = camera
+    return matched
+
+
+def checked_pose(b_from_a: Float64[np.ndarray, "4 4"], photo_name: str) -> Float64[np.ndarray, "4 4"]:
+    """The pose with its rotation made exact. Raises ReconstructionError where it is none."""
+    if not np.isfinite(b_from_a).all():
+        raise _unusable(f"The camera of {photo_name} has numbers that are not finite.")
+    rotation = b_from_a[:3, :3]
+    left, stretches, right = np.linalg.svd(rotation)
+    if np.abs(stretches - 1).max() > _ROTATION_TOLERANCE or np.linalg.det(rotation) < 0:
+        text = f"The camera matrix of {photo_name} is no rotation with a position: it stretches or mirrors."
+        raise _unusable(text, "Export the cameras without scale.")
+    if not np.allclose(b_from_a[3], [0, 0, 0, 1]):
+        raise _unusable(f"The camera matrix of {photo_name} does not end in 0 0 0 1.")
+    exact = np.eye(4)
+    exact[:3, :3] = left @ right
+    exact[:3, 3] = b_from_a[:3, 3]
+    return exact
+
+
+def _find_source(given: Path) -> Path:
+    """The file or the model folder that is meant."""
+    if given.is_file() and given.suffix.lower() == ".json":
+        return given
+    if given.is_file():
+        # One of the files of a COLMAP model.
+        given = given.parent
+    if (given / "transforms.json").is_file():
+        return given / "transforms.json"
+    for folder in (given, given / "sparse" / "0", given / "sparse", given / "0"):
+        if any((folder / f"cameras{suffix}").is_file() for suffix in (".bin", ".txt")):
+            return folder
+    text = f"There are no cameras in {given}."
+    raise _unusable(text, "Give a nerfstudio transforms.json or the folder of a COLMAP model.")
+
+
+def _from_transforms(photos: Sequence[Photo], path: Path) -> Placement:
+    frames = read_frames(path)
+    matched = _matched(photos, [str(frame["file_path"]) for frame in frames], path)
+    placed = []
+    for index, number in sorted(matched.items()):
+        photo, frame = photos[index], frames[number]
+        lens = frame_lens(frame, photo)
+        placed.append(_placed(index, photo, lens, camera_from_world(frame, photo.name)))
+    return Placement(
+        placed=tuple(placed),
+        sparse_positions=np.zeros((0, 3)),
+        sparse_visibility=np.zeros((0, len(placed)), bool),
+        reprojection_error_px=None,
+    )
+
+
+def _from_model(photos: Sequence[Photo], folder: Path) -> Placement:
+    try:
+        model = pycolmap.Reconstruction(folder)
+    except (ValueError, RuntimeError, IndexError) as error:
+        raise _unusable(
+            f"The COLMAP model in {folder} cannot be read ({error}).", "Export it again."
+        ) from error
+    image_ids = sorted(model.reg_image_ids())
+    matched = _matched(photos, [model.images[i].name for i in image_ids], folder)
+    placed, ids = [], []
+    for index, number in sorted(matched.items()):
+        image = model.images[image_ids[number]]
+        lens = model.cameras[image.camera_id]
+        placed.append(_placed(index, photos[index], lens, rigid_matrix(image.cam_from_world())))
+        ids.append(image_ids[number])
+    positions, visibility = sparse_points(model, ids)
+    return Placement(
+        placed=tuple(placed),
+        sparse_positions=positions,
+        sparse_visibility=visibility,
+        reprojection_error_px=None,
+    )
+
+
+def _matched(photos: Sequence[Photo], camera_paths: Sequence[str], source: Path) -> dict[int, int]:
+    photo_paths = [photo.path.as_posix() for photo in photos]
+    matched = match_by_name(photo_paths, camera_paths)
+    if not matched:
+        theirs = camera_paths[0] if camera_paths else "nothing"
+        text = (
+            f"No camera in {source.name} is named like a photograph: {theirs} there, {photos[0].name} here."
+        )
+        raise _unusable(text)
+    return matched
+
+
+def _likeness(photo_path: str, camera_path: str) -> int:
+    """0 for another file; more for the same extension, and more for each folder above that agrees."""
+    photo = PurePosixPath(photo_path.lower())
+    camera = PurePosixPath(camera_path.lower().replace("\\", "/"))
+    # A camera may be named without extension: then its stem can have dots.
+    if photo.stem not in (camera.stem, camera.name):
+        return 0
+    likeness = 2 if photo.name == camera.name else 1
+    for ours, theirs in zip(photo.parts[-2::-1], camera.parts[-2::-1], strict=False):
+        if ours != theirs:
+            break
+        likeness += 2
+    return likeness
+
+
+def _placed(index: int, photo: Photo, lens: pycolmap.Camera, pose: Float64[np.ndarray, "4 4"]) -> PlacedPhoto:
+    if not same_shape(lens.width, lens.height, photo.original_width, photo.original_height):
+        ours = f"{photo.original_width}x{photo.original_height}"
+        text = (
+            f"The camera of {photo.name} is for {lens.width}x{lens.height} pixels, the photograph has {ours}."
+        )
+        raise _unusable(text)
+    if not np.isfinite(lens.params).all() or min(lens.focal_length_x, lens.focal_length_y) <= 0:
+        raise _unusable(f"The focal length or distortion of {photo.name} is no usable number.")
+    return PlacedPhoto(index=index, lens=lens, camera_from_world=checked_pose(pose, photo.name))
+
+
+def _unusable(text: str, remedy: str = _CHECK) -> ReconstructionError:
+    return ReconstructionError(ErrorCode.CAMERAS_UNUSABLE, text, remedy)

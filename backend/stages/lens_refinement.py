@@ -1,0 +1,137 @@
+"""Lens parameters weighed between what photographs tell and what is known beforehand.
+
+With few photographs the principal point and the focal length can slide far along a weak direction of the
+adjustment; held fixed they bend every camera. So the adjustment runs with all free, its covariance says how
+weak each direction is, and Bayes' rule for Gaussians joins it with the prior (one Kalman update). Then
+cameras and points are adjusted once more to the lens so found.
+
+Parameters of SIMPLE_RADIAL: focal length, principal point x, y (pixels), radial coefficient.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import PIL.Image  # noqa: F401 - pycolmap loaded before Pillow corrupts memory when Pillow next saves
+import pycolmap
+from jaxtyping import Float64
+
+from ..scene import Decision
+
+_ROBUST_SCALE_PX = 0.5
+"""Of the Cauchy loss: wrong matches pull the principal point further than anything else."""
+
+_ERROR_INFLATION = 2.0
+"""Matches err together, not one by one, so the covariance of independent errors is too small."""
+
+_FOCAL_SIGMA_WITH_EXIF = 0.05
+"""Relative. EXIF rounds to millimetres and knows nothing of focusing and of digital zoom."""
+_FOCAL_SIGMA_WITHOUT = 0.5
+_CENTRE_SIGMA = 0.01
+"""Of the longer side: what lenses and stabilised sensors are off by."""
+_RADIAL_SIGMA = 0.1
+
+
+_SANE_FOCAL_RATIO = (0.1, 10.0)
+"""Of the longer side."""
+_SANE_RADIAL = 1.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Gaussian:
+    """A belief about parameters."""
+
+    mean: Float64[np.ndarray, "parameters"]
+    covariance: Float64[np.ndarray, "parameters parameters"]
+
+
+def joined(one: Gaussian, other: Gaussian) -> Gaussian:
+    """The product of two beliefs that are independent of each other, by information (inverse covariance)."""
+    information, other_information = np.linalg.inv(one.covariance), np.linalg.inv(other.covariance)
+    covariance = np.linalg.inv(information + other_information)
+    mean = covariance @ (information @ one.mean + other_information @ other.mean)
+    return Gaussian(mean=mean, covariance=covariance)
+
+
+def refine_lenses(model: pycolmap.Reconstruction) -> tuple[Decision, ...]:
+    """Adjust the model and its SIMPLE_RADIAL lenses in place; say for each lens what was decided.
+
+    A lens with `has_prior_focal_length` is expected to hold that focal length. Two photographs alone say too
+    little: their lenses stay.
+    """
+    mapped = {camera_id: np.array(camera.params) for camera_id, camera in model.cameras.items()}
+    estimates = _estimates(model) if model.num_reg_images() >= 3 else {}
+    decisions = []
+    for camera_id, camera in sorted(model.cameras.items()):
+        before, estimate = mapped[camera_id], estimates.get(camera_id)
+        camera.params = before
+        if estimate is not None:
+            camera.params = joined(estimate, _prior(camera, before[0])).mean
+            if camera.has_bogus_params(*_SANE_FOCAL_RATIO, _SANE_RADIAL):
+                camera.params, estimate = before, None
+        decisions.append(_decision(camera, before[0], estimate))
+    _adjust(model, free_lens=False)
+    model.update_point_3d_errors()
+    return tuple(decisions)
+
+
+def _prior(camera: pycolmap.Camera, focal_px: float) -> Gaussian:
+    """What is believed of a lens before any photograph is looked at."""
+    focal_sigma = _FOCAL_SIGMA_WITH_EXIF if camera.has_prior_focal_length else _FOCAL_SIGMA_WITHOUT
+    centre_sigma_px = _CENTRE_SIGMA * max(camera.width, camera.height)
+    sigmas = [focal_sigma * focal_px, centre_sigma_px, centre_sigma_px, _RADIAL_SIGMA]
+    return Gaussian(
+        mean=np.array([focal_px, camera.width / 2, camera.height / 2, 0.0]),
+        covariance=np.diag(np.square(sigmas)),
+    )
+
+
+def _estimates(model: pycolmap.Reconstruction) -> dict[int, Gaussian]:
+    """Adjusts the model with all lens parameters free; what it says of each lens, where it says anything."""
+    adjuster = _adjust(model, free_lens=True)
+    model.update_point_3d_errors()
+    error_px = _ERROR_INFLATION * model.compute_mean_reprojection_error()
+    covariances = pycolmap.estimate_ba_covariance(pycolmap.BACovarianceOptions(), model, adjuster)
+    if covariances is None:
+        return {}
+    estimates = {}
+    for camera_id, camera in model.cameras.items():
+        covariance = covariances.get_other_params_cov(camera.params)
+        # A lens whose photographs were not placed is no part of the adjustment.
+        if covariance is not None and np.isfinite(covariance).all():
+            mean = np.array(camera.params)
+            estimates[camera_id] = Gaussian(mean=mean, covariance=np.asarray(covariance) * error_px**2)
+    return estimates
+
+
+def _adjust(model: pycolmap.Reconstruction, *, free_lens: bool) -> pycolmap.CeresBundleAdjuster:
+    options = pycolmap.BundleAdjustmentOptions()
+    options.print_summary = False
+    options.refine_focal_length = free_lens
+    options.refine_principal_point = free_lens
+    options.refine_extra_params = free_lens
+    options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
+    options.ceres.loss_function_scale = _ROBUST_SCALE_PX
+    options.ceres.solver_options.function_tolerance = 1e-6
+    # One thread: sums in another order would be another result.
+    options.ceres.solver_options.num_threads = 1
+    config = pycolmap.BundleAdjustmentConfig()
+    for image_id in model.reg_image_ids():
+        config.add_image(image_id)
+    config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+    adjuster = pycolmap.create_default_ceres_bundle_adjuster(options, config, model)
+    adjuster.solve()
+    return adjuster
+
+
+def _decision(camera: pycolmap.Camera, before_px: float, estimate: Gaussian | None) -> Decision:
+    what = f"focal length of the {camera.width}x{camera.height} photographs"
+    source = "EXIF" if camera.has_prior_focal_length else "the first pairs"
+    if estimate is None:
+        because = "the photographs alone do not determine it"
+        return Decision(what=what, choice=f"{before_px:.0f} px, from {source}", because=because)
+    sigma_px = float(np.sqrt(estimate.covariance[0, 0]))
+    return Decision(
+        what=what,
+        choice=f"{camera.focal_length:.0f} px, refined ({source}: {before_px:.0f} px)",
+        because=f"the photographs determine it to {sigma_px:.1f} px",
+    )

@@ -1,0 +1,198 @@
+"""From a photograph through any lens to a view through a pinhole.
+
+A lens is a `pycolmap.Camera`: a projection model with its parameters over an image size. Its image points
+are in pixels, the centre of the top left one at (0.5, 0.5); rays are points with z = 1 in camera axes.
+"""
+
+from collections.abc import Sequence
+from copy import copy
+from dataclasses import dataclass
+
+import numpy as np
+import PIL.Image  # noqa: F401 - pycolmap loaded before Pillow corrupts memory when Pillow next saves
+import pycolmap
+from jaxtyping import Bool, Float, Float32, Float64
+from scipy.ndimage import map_coordinates
+
+from ..errors import ErrorCode, ReconstructionError
+from ..scene import Camera, Decision, Photo, View
+
+SMALLEST_ZOOM, LARGEST_ZOOM = 0.5, 4.0
+"""Of the pinhole's focal length against the lens's. Below the first, a wide lens would lose half its
+resolution in the middle to show a little more at the corners."""
+
+_BORDER_STEPS = 33
+_ZOOM_STEPS = 64
+_ZOOM_BISECTIONS = 12
+_ROUND_TRIP_PX = 0.01
+"""Where a distortion folds back on itself, going there and back ends elsewhere."""
+_OUTSIDE_PX = 0.5
+"""A border this far outside still has its nearest pixel under it."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlacedPhoto:
+    """Where a photograph was taken and through which lens."""
+
+    index: int
+    """Of the photograph among those given."""
+    lens: pycolmap.Camera
+    """Over an image of the same shape as the photograph, of any size."""
+    camera_from_world: Float64[np.ndarray, "4 4"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Placement:
+    """What is known of the cameras before the photographs are undistorted."""
+
+    placed: tuple[PlacedPhoto, ...]
+    """In the order of the photographs."""
+    sparse_positions: Float64[np.ndarray, "points 3"]
+    sparse_visibility: Bool[np.ndarray, "points placed"]
+    reprojection_error_px: float | None
+    """In pixels of the photographs; None where the cameras were given."""
+    decisions: tuple[Decision, ...] = ()
+
+
+def undistorted_view(photo: Photo, placed: PlacedPhoto) -> View:
+    """The photograph as a pinhole camera at the same place would have taken it, at the photograph's size.
+
+    The principal point stays; the focal length is the smallest that leaves no blank border.
+    Raises ReconstructionError(CAMERAS_UNUSABLE) where the lens does not bend light in a sensible way.
+    """
+    height, width = photo.image_srgb.shape[:2]
+    lens = rescaled_lens(placed.lens, width, height)
+    zoom = smallest_filled_zoom_or_none(lens)
+    if zoom is None:
+        text = f"The lens distortion given for {photo.name} folds the picture or shows nothing of it."
+        raise ReconstructionError(ErrorCode.CAMERAS_UNUSABLE, text, "Check its distortion coefficients.")
+    camera = Camera(
+        camera_from_world=placed.camera_from_world,
+        fx_px=lens.focal_length_x * zoom,
+        fy_px=lens.focal_length_y * zoom,
+        cx_px=lens.principal_point_x,
+        cy_px=lens.principal_point_y,
+        width=width,
+        height=height,
+    )
+    if is_pinhole(lens):
+        return View(name=photo.name, camera=camera, image_srgb=photo.image_srgb, mask=photo.mask)
+    sources = source_pixels(lens, camera)
+    mask = None if photo.mask is None else sampled(photo.mask, sources)
+    return View(name=photo.name, camera=camera, image_srgb=sampled(photo.image_srgb, sources), mask=mask)
+
+
+def rescaled_lens(lens: pycolmap.Camera, width: int, height: int) -> pycolmap.Camera:
+    """The same lens over an image of another size."""
+    rescaled = copy(lens)
+    rescaled.rescale(width, height)
+    return rescaled
+
+
+def is_pinhole(lens: pycolmap.Camera) -> bool:
+    """Whether straight lines stay straight; a fisheye without coefficients still bends them."""
+    return bool(lens.is_perspective_pinhole() and lens.is_undistorted())
+
+
+def smallest_filled_zoom_or_none(lens: pycolmap.Camera) -> float | None:
+    """The smallest focal length, in those of the lens, at which a pinhole view shows the picture alone.
+
+    1 for a pinhole. None where no zoom does: the lens folds, or is no perspective lens.
+    """
+    if not lens.is_perspective():
+        return None
+    if is_pinhole(lens):
+        return 1.0
+    filled = None
+    for zoom in np.geomspace(LARGEST_ZOOM, SMALLEST_ZOOM, _ZOOM_STEPS):
+        if not _is_filled(lens, zoom):
+            return filled if filled is None else _bisected_zoom(lens, zoom, filled)
+        filled = float(zoom)
+    return filled
+
+
+def source_pixels(lens: pycolmap.Camera, camera: Camera) -> Float64[np.ndarray, "height width 2"]:
+    """For each pixel of the pinhole camera, the image point of the lens on the same ray."""
+    columns, rows = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
+    rays = np.stack(
+        [
+            (columns - camera.cx_px) / camera.fx_px,
+            (rows - camera.cy_px) / camera.fy_px,
+            np.ones_like(columns),
+        ],
+        axis=-1,
+    )
+    image_points: Float64[np.ndarray, "pixels 2"] = lens.img_from_cam(rays.reshape(-1, 3))
+    return image_points.reshape(camera.height, camera.width, 2)
+
+
+def sampled(
+    image: Float32[np.ndarray, "height width *channels"],
+    image_points: Float[np.ndarray, "new_height new_width 2"],
+) -> Float32[np.ndarray, "new_height new_width *channels"]:
+    """Bilinear samples at points (x, y) in pixels; beyond the border its nearest pixel."""
+    coordinates = np.stack([image_points[..., 1], image_points[..., 0]]) - 0.5
+    if image.ndim == 2:
+        plane: Float32[np.ndarray, "new_height new_width"]
+        plane = map_coordinates(image, coordinates, order=1, mode="nearest")
+        return plane
+    channels = [sampled(image[..., index], image_points) for index in range(image.shape[2])]
+    return np.stack(channels, axis=-1)
+
+
+def _bisected_zoom(lens: pycolmap.Camera, too_small: float, filled: float) -> float:
+    for _ in range(_ZOOM_BISECTIONS):
+        middle = (too_small * filled) ** 0.5
+        if _is_filled(lens, middle):
+            filled = middle
+        else:
+            too_small = middle
+    return filled
+
+
+def _is_filled(lens: pycolmap.Camera, zoom: float) -> bool:
+    """Whether the border of the zoomed pinhole view lies inside the picture, on this side of any fold."""
+    steps = np.linspace(0.0, 1.0, _BORDER_STEPS)
+    zeros, ones = np.zeros_like(steps), np.ones_like(steps)
+    border = np.concatenate(
+        [
+            np.stack([steps, zeros], axis=1),
+            np.stack([steps, ones], axis=1),
+            np.stack([zeros, steps], axis=1),
+            np.stack([ones, steps], axis=1),
+        ]
+    ) * (lens.width, lens.height)
+    focal = np.array([lens.focal_length_x, lens.focal_length_y])
+    centre = np.array([lens.principal_point_x, lens.principal_point_y])
+    rays = (border - centre) / (focal * zoom)
+    # Along the way to the border as well: a fold may come before it.
+    rays = np.concatenate([rays * share for share in (0.25, 0.5, 0.75, 1.0)])
+    image_points = lens.img_from_cam(np.column_stack([rays, np.ones(len(rays))]))
+    inside = (image_points >= -_OUTSIDE_PX) & (image_points <= np.add((lens.width, lens.height), _OUTSIDE_PX))
+    if not inside.all():
+        return False
+    back = lens.cam_from_img(image_points)
+    return bool((np.abs(back - rays) * focal).max() <= _ROUND_TRIP_PX)
+
+
+def rigid_matrix(b_from_a: pycolmap.Rigid3d) -> Float64[np.ndarray, "4 4"]:
+    """A rigid transform as a 4x4 matrix."""
+    return np.vstack([b_from_a.matrix(), [0.0, 0.0, 0.0, 1.0]])
+
+
+def sparse_points(
+    model: pycolmap.Reconstruction, image_ids: Sequence[int]
+) -> tuple[Float64[np.ndarray, "points 3"], Bool[np.ndarray, "points images"]]:
+    """Positions of the points that at least two of the images see, and which of them do."""
+    column = {image_id: index for index, image_id in enumerate(image_ids)}
+    positions, visibility = [], []
+    for _, point in sorted(model.points3D.items()):
+        seen = np.zeros(len(image_ids), bool)
+        seen[[column[e.image_id] for e in point.track.elements if e.image_id in column]] = True
+        if seen.sum() >= 2:
+            positions.append(point.xyz)
+            visibility.append(seen)
+    return (
+        np.array(positions, np.float64).reshape(-1, 3),
+        np.array(visibility, bool).reshape(-1, len(image_ids)),
+    )

@@ -1,0 +1,149 @@
+"""First stage: photographs from files, upright and at working size, each with its mask."""
+
+import re
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float32
+
+from ..errors import ErrorCode, ReconstructionError
+from ..images import DecodedImage, read_image, resized, same_shape
+from ..scene import Photo, Progress
+
+PHOTO_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp"})
+
+
+@dataclass(frozen=True, kw_only=True)
+class PhotosConfig:
+    """How the photographs are read."""
+
+    max_side_px: int = 1600
+    """Larger photographs are scaled down until their longer side is this."""
+
+
+def load_photos(
+    sources: Sequence[Path],
+    masks_folder: Path | None,
+    config: PhotosConfig,
+    *,
+    progress: Progress,
+) -> tuple[Photo, ...]:
+    """The photographs among the sources, which are files or folders, in natural order.
+
+    A mask in masks_folder counts before the alpha channel. Photographs without either have no mask.
+    Raises ReconstructionError: NO_PHOTOS, TOO_FEW_PHOTOS, PHOTO_UNREADABLE, MASK_UNUSABLE.
+    """
+    paths = find_photos(sources)
+    names = _unique_names(paths)
+    masks = {} if masks_folder is None else match_masks(names, masks_folder)
+    photos = []
+    for index, (path, name) in enumerate(zip(paths, names, strict=True)):
+        progress(index / len(paths), f"Reading {name}")
+        photos.append(_load_photo(path, name, masks.get(name), config))
+    return tuple(photos)
+
+
+def find_photos(sources: Sequence[Path]) -> list[Path]:
+    """Image files among the sources, each once, in natural order; of a folder its visible image files."""
+    found: dict[Path, Path] = {}
+    for source in sources:
+        if not source.exists():
+            raise ReconstructionError(
+                ErrorCode.NO_PHOTOS, f"There is no file or folder {source}.", "Check the path."
+            )
+        members = [path for path in source.iterdir() if _is_photo(path)] if source.is_dir() else [source]
+        found.update({path.resolve(): path for path in members})
+    if not found:
+        places = ", ".join(str(source) for source in sources) or "the list"
+        text = f"There are no photographs in {places}."
+        raise ReconstructionError(ErrorCode.NO_PHOTOS, text, "Give a folder with JPEG, PNG or TIFF files.")
+    if len(found) == 1:
+        text = "There is only one photograph."
+        raise ReconstructionError(
+            ErrorCode.TOO_FEW_PHOTOS, text, "Take at least three, from different places."
+        )
+    return sorted(found.values(), key=lambda path: (natural_order(path.name), str(path)))
+
+
+def natural_order(name: str) -> tuple[tuple[int, int, str], ...]:
+    """A sorting key by which 2.jpg stands before 10.jpg."""
+    parts = re.split(r"([0-9]+)", name.lower())
+    return tuple((0, int(part), "") if index % 2 else (1, 0, part) for index, part in enumerate(parts))
+
+
+def match_masks(names: Sequence[str], masks_folder: Path) -> dict[str, Path]:
+    """The mask file of each photograph that has one, by the photograph's name.
+
+    For a.jpg: a.png, a_mask.png, a.jpg.png or a.jpg_mask.png, in any image format and letter case.
+    """
+    if not masks_folder.is_dir():
+        text = f"There is no folder {masks_folder} with masks."
+        raise ReconstructionError(ErrorCode.MASK_UNUSABLE, text, "Check the path.")
+    by_stem = {path.stem.lower(): path for path in sorted(masks_folder.iterdir()) if _is_photo(path)}
+    matched = {}
+    for name in names:
+        base = Path(name)
+        stems = [base.stem, f"{base.stem}_mask", base.name, f"{base.name}_mask"]
+        masks = [by_stem[stem.lower()] for stem in stems if stem.lower() in by_stem]
+        if masks:
+            matched[name] = masks[0]
+    if not matched:
+        text = f"No mask in {masks_folder} is named like a photograph."
+        remedy = f"Name the mask of {names[0]} {Path(names[0]).stem}.png."
+        raise ReconstructionError(ErrorCode.MASK_UNUSABLE, text, remedy)
+    return matched
+
+
+def _is_photo(path: Path) -> bool:
+    return path.suffix.lower() in PHOTO_SUFFIXES and not path.name.startswith(".") and path.is_file()
+
+
+def _unique_names(paths: Sequence[Path]) -> list[str]:
+    """File names, with the folder's where two are the same, and a number where that is not enough."""
+    count: Mapping[str, int] = Counter(path.name for path in paths)
+    names = [path.name if count[path.name] == 1 else f"{path.parent.name}/{path.name}" for path in paths]
+    again = Counter(names)
+    return [name if again[name] == 1 else f"{index}/{name}" for index, name in enumerate(names, start=1)]
+
+
+def _load_photo(path: Path, name: str, mask_path: Path | None, config: PhotosConfig) -> Photo:
+    decoded = read_image(path, config.max_side_px)
+    height, width = decoded.image_srgb.shape[:2]
+    mask = decoded.mask if mask_path is None else _load_mask(mask_path, name, width, height)
+    if mask is not None and mask.max() == 0:
+        text = f"The mask of {name} is empty: it leaves nothing of the photograph."
+        raise ReconstructionError(ErrorCode.MASK_UNUSABLE, text, "Make the subject white and the rest black.")
+    return Photo(
+        name=name,
+        path=path,
+        image_srgb=decoded.image_srgb,
+        mask=mask,
+        original_width=decoded.original_width,
+        original_height=decoded.original_height,
+        focal_px=decoded.focal_px,
+    )
+
+
+def _load_mask(path: Path, photo_name: str, width: int, height: int) -> Float32[np.ndarray, "height width"]:
+    """The mask in a file, scaled to the size of its photograph and to values from 0 to 1."""
+    try:
+        decoded = read_image(path)
+    except ReconstructionError as error:
+        raise ReconstructionError(ErrorCode.MASK_UNUSABLE, error.text, error.remedy) from error
+    if not same_shape(decoded.original_width, decoded.original_height, width, height):
+        size = f"{decoded.original_width}x{decoded.original_height}"
+        text = f"The mask {path.name} ({size}) has another shape than {photo_name} ({width}x{height})."
+        raise ReconstructionError(
+            ErrorCode.MASK_UNUSABLE, text, "Make masks from the photographs as they are."
+        )
+    return resized(_mask_values(decoded), width, height)
+
+
+def _mask_values(decoded: DecodedImage) -> Float32[np.ndarray, "height width"]:
+    """The alpha channel, or else the brightness; 1 where it is largest: some tools write 1 of 255."""
+    values = decoded.image_srgb.mean(axis=2) if decoded.mask is None else decoded.mask
+    largest = float(values.max())
+    return values if largest == 0 else (values / largest).astype(np.float32)

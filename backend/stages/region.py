@@ -1,0 +1,196 @@
+"""What to reconstruct: a sphere around the subject, found from masks, sparse points or cameras.
+
+In this order of evidence: masks cut out the subject from every side; without them, triangulated
+points say where the photographs overlap; without those, the cameras' axes say what they look at.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float64
+
+from ..errors import ErrorCode, ReconstructionError
+from ..scene import Camera, Decision, Progress, Region, SolvedCameras, View
+
+
+@dataclass(frozen=True, kw_only=True)
+class RegionConfig:
+    """Where to look, if it is not to be found automatically."""
+
+    centre_world: tuple[float, float, float] | None = None
+    radius_world: float | None = None
+    margin: float = 1.08
+    """Room left around the subject."""
+    hull_cells: int = 64
+    """Cells along each axis of the grid that masks are carved from."""
+
+
+def find_region(solved: SolvedCameras, config: RegionConfig, *, progress: Progress) -> Region:
+    """The sphere that holds the subject.
+
+    Raises ReconstructionError(NO_SURFACE) if the masks have nothing in common,
+    and ReconstructionError(CAMERAS_UNUSABLE) if the cameras do not look at one place.
+    """
+    progress(0.0, "finding the subject")
+    if config.centre_world is not None and config.radius_world is not None:
+        return _region(np.array(config.centre_world), config.radius_world, "as given", "set by the user")
+    masked = [view for view in solved.views if view.mask is not None]
+    if len(masked) >= 2:
+        centre, radius = _of_masks(masked, config)
+        return _region(
+            centre, radius * config.margin, "the masked subject", f"{len(masked)} photographs have masks"
+        )
+    if len(solved.sparse_positions) >= 20:
+        centre, radius = _of_points(solved)
+        because = f"no masks, but {len(solved.sparse_positions)} triangulated points"
+        return _region(centre, radius * config.margin, "where the photographs overlap", because)
+    centre, radius = _of_cameras([view.camera for view in solved.views])
+    return _region(centre, radius, "what all cameras look at", "neither masks nor triangulated points")
+
+
+def _region(centre: Float64[np.ndarray, "3"], radius: float, choice: str, because: str) -> Region:
+    object_from_world = np.eye(4)
+    object_from_world[:3, :3] /= radius
+    object_from_world[:3, 3] = -centre / radius
+    decision = Decision(what="region", choice=choice, because=because)
+    return Region(object_from_world=object_from_world, decisions=(decision,))
+
+
+def nearest_to_axes(cameras: list[Camera]) -> Float64[np.ndarray, "3"]:
+    """The point with the least squared distance to all optical axes."""
+    system, right = np.zeros((3, 3)), np.zeros(3)
+    for camera in cameras:
+        axis = camera.camera_from_world[2, :3]
+        across = np.eye(3) - np.outer(axis, axis)
+        system += across
+        right += across @ camera.position
+    solution: Float64[np.ndarray, "3"] = np.linalg.lstsq(system, right, rcond=1e-9)[0]
+    return solution
+
+
+def _of_cameras(cameras: list[Camera]) -> tuple[Float64[np.ndarray, "3"], float]:
+    """The largest sphere around the common look-at point that every photograph shows whole."""
+    centre = nearest_to_axes(cameras)
+    radius = min(_radius_in_frame(camera, centre) for camera in cameras)
+    if radius <= 0:
+        raise ReconstructionError(
+            ErrorCode.CAMERAS_UNUSABLE,
+            "The cameras do not look at a common place, so the subject can not be located.",
+            "Check the cameras file, or give masks of the subject.",
+        )
+    return centre, radius
+
+
+def _radius_in_frame(camera: Camera, centre: Float64[np.ndarray, "3"]) -> float:
+    """Distance of a point from the nearest side of the camera's frustum; negative outside."""
+    x, y, z = camera.camera_from_world[:3, :3] @ centre + camera.camera_from_world[:3, 3]
+    sides = np.array(
+        [
+            [camera.fx_px, 0, camera.cx_px],
+            [-camera.fx_px, 0, camera.width - camera.cx_px],
+            [0, camera.fy_px, camera.cy_px],
+            [0, -camera.fy_px, camera.height - camera.cy_px],
+            [0, 0, 1],
+        ]
+    )
+    return float((sides @ [x, y, z] / np.linalg.norm(sides, axis=1)).min())
+
+
+def _of_points(solved: SolvedCameras) -> tuple[Float64[np.ndarray, "3"], float]:
+    """A sphere around the bulk of the points, each weighing as much as photographs see it.
+
+    Points far behind the subject are few and seen by few; the weighted median and a high quantile
+    of the distances leave them out.
+    """
+    weight = solved.sparse_visibility.sum(axis=1).astype(np.float64) - 1
+    weight = np.maximum(weight, 0.1)
+    points = solved.sparse_positions
+    centre = np.array([weighted_quantile(points[:, axis], weight, 0.5) for axis in range(3)])
+    for _ in range(3):
+        distance = np.linalg.norm(points - centre, axis=1)
+        near = distance <= weighted_quantile(distance, weight, 0.9)
+        low, high = np.quantile(points[near], 0.02, axis=0), np.quantile(points[near], 0.98, axis=0)
+        centre = (low + high) / 2
+    distance = np.linalg.norm(points - centre, axis=1)
+    return centre, weighted_quantile(distance, weight, 0.93)
+
+
+def weighted_quantile(
+    values: Float64[np.ndarray, "n"], weights: Float64[np.ndarray, "n"], share: float
+) -> float:
+    """The value below which `share` of the weight lies."""
+    order = np.argsort(values)
+    cumulative = np.cumsum(weights[order])
+    return float(values[order][np.searchsorted(cumulative, share * cumulative[-1])])
+
+
+def _of_masks(views: list[View], config: RegionConfig) -> tuple[Float64[np.ndarray, "3"], float]:
+    """Bounding sphere of the visual hull: what lies inside the masks of all photographs that show it.
+
+    Photographs from nearly one side leave the hull open in depth; there the subject is taken to be
+    no deeper than it is wide.
+    """
+    first_centre, first_radius = _first_guess(views)
+    centre, radius = first_centre, first_radius
+    for _ in range(3):
+        steps = np.linspace(-1, 1, config.hull_cells)
+        cells = (
+            np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), axis=-1).reshape(-1, 3) * radius
+            + centre
+        )
+        cells = cells[np.linalg.norm(cells - first_centre, axis=1) <= first_radius]
+        kept = cells[_in_all_masks(cells, views)]
+        if not len(kept):
+            raise ReconstructionError(
+                ErrorCode.NO_SURFACE,
+                "The masks have no part of space in common.",
+                "Check that masks are white on the subject and belong to these photographs and cameras.",
+            )
+        low, high = kept.min(axis=0), kept.max(axis=0)
+        centre = (low + high) / 2
+        radius = float(np.linalg.norm(kept - centre, axis=1).max()) + 2 * radius / config.hull_cells
+    return centre, radius
+
+
+def _first_guess(views: list[View]) -> tuple[Float64[np.ndarray, "3"], float]:
+    """Where the rays through the middles of the masks meet, and how large the masks are there."""
+    system, right = np.zeros((3, 3)), np.zeros(3)
+    rays = []
+    for view in views:
+        assert view.mask is not None
+        rows, columns = np.nonzero(view.mask > 0.5)
+        if not len(rows):
+            raise ReconstructionError(
+                ErrorCode.MASK_UNUSABLE,
+                f"The mask of {view.name} is empty.",
+                "Masks must be white on the subject and black elsewhere.",
+            )
+        middle = np.array([(columns.min() + columns.max() + 1) / 2, (rows.min() + rows.max() + 1) / 2, 1.0])
+        direction = view.camera.camera_from_world[:3, :3].T @ np.linalg.solve(view.camera.intrinsics, middle)
+        direction /= np.linalg.norm(direction)
+        across = np.eye(3) - np.outer(direction, direction)
+        system += across
+        right += across @ view.camera.position
+        size_px = float(np.hypot(columns + 0.5 - middle[0], rows + 0.5 - middle[1]).max())
+        rays.append((view.camera, size_px))
+    centre = np.linalg.lstsq(system, right, rcond=1e-9)[0]
+    radius = max(np.linalg.norm(centre - c.position) * size / c.fx_px for c, size in rays)
+    return centre, float(radius) * 1.1
+
+
+def _in_all_masks(points: Float64[np.ndarray, "points 3"], views: list[View]) -> Bool[np.ndarray, "points"]:
+    """True for points that no photograph shows off the subject, and that at least two show on it."""
+    off, on = np.zeros(len(points), bool), np.zeros(len(points), int)
+    for view in views:
+        assert view.mask is not None
+        in_camera = points @ view.camera.camera_from_world[:3, :3].T + view.camera.camera_from_world[:3, 3]
+        front = in_camera[:, 2] > 0
+        homogeneous = in_camera @ view.camera.intrinsics.T
+        pixel = np.floor(homogeneous[:, :2] / np.where(front, in_camera[:, 2], 1.0)[:, None]).astype(int)
+        shown = front & (pixel >= 0).all(axis=1)
+        shown &= (pixel[:, 0] < view.camera.width) & (pixel[:, 1] < view.camera.height)
+        inside = np.zeros(len(points), bool)
+        inside[shown] = view.mask[pixel[shown, 1], pixel[shown, 0]] > 0.5
+        off |= shown & ~inside
+        on += inside
+    return ~off & (on >= min(2, len(views)))

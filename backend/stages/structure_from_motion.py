@@ -1,0 +1,337 @@
+"""Cameras from the photographs alone, by pycolmap's incremental mapping, set up for few photographs.
+
+The photographs are matched without their masks: the background places cameras as well as the subject does.
+"""
+
+import os
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import PIL.Image
+import pycolmap
+from jaxtyping import Float32, Float64, UInt8
+
+from ..errors import ErrorCode, ReconstructionError
+from ..images import fitted_size, read_image, resized
+from ..scene import Decision, Photo, Progress
+from .lens_refinement import refine_lenses
+from .lenses import PlacedPhoto, Placement, rigid_matrix, sparse_points
+
+LENS_MODEL = "SIMPLE_RADIAL"
+"""One focal length, the principal point and one distortion coefficient. With separate focal lengths and four
+coefficients the cameras of the surveyed fountain come out two to three times worse."""
+
+_UNKNOWN_FOCAL_FACTOR = 1.2
+"""Focal length to begin with where EXIF has none, in longer sides of the photograph."""
+
+_FEATURE_BUDGET = 48_000
+"""Of all photographs together: with many, each needs fewer, and the time stays bounded."""
+_FEWEST_FEATURES = 2_500
+
+_MOST_THREADS = 4
+"""Feature extraction holds about 0.4 GB a thread."""
+
+_LARGEST_ERROR_PX = 2.0
+_SMALLEST_ANGLE_DEG = 1.0
+"""Under this, measured at the sparse points, the photographs are from one spot."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Attempt:
+    """How strict the mapper is with its first pair and with each further photograph.
+
+    pycolmap itself halves the first pair's two limits twice before it gives up.
+    """
+
+    guided: bool
+    """Matches again along the epipolar lines: more of them, less exact, and slow."""
+    initial_angle_deg: float
+    initial_inliers: int
+    further_inliers: int
+
+
+_ATTEMPTS = (
+    _Attempt(guided=False, initial_angle_deg=16.0, initial_inliers=100, further_inliers=30),
+    _Attempt(guided=False, initial_angle_deg=6.0, initial_inliers=40, further_inliers=20),
+    _Attempt(guided=True, initial_angle_deg=16.0, initial_inliers=100, further_inliers=30),
+    _Attempt(guided=True, initial_angle_deg=6.0, initial_inliers=40, further_inliers=15),
+)
+"""Tried in this order until all photographs are placed."""
+
+
+def estimate_placement(
+    photos: Sequence[Photo],
+    *,
+    max_side_px: int,
+    max_features: int,
+    workdir: Path,
+    seed: int,
+    progress: Progress,
+) -> Placement:
+    """Cameras of the photographs that can be placed, and the features they share, in a frame of its own.
+
+    The same seed gives the same cameras to the bit. Files are written to workdir alone.
+    Raises ReconstructionError: NO_OVERLAP, NO_PARALLAX, TOO_FEW_PLACED.
+    """
+    folder = workdir / "pictures"
+    database = workdir / "features.db"
+    folder.mkdir(parents=True, exist_ok=True)
+    database.unlink(missing_ok=True)
+    sizes = [_write_picture(photo, folder / _picture_name(i), max_side_px) for i, photo in enumerate(photos)]
+    num_features = min(max_features, max(_FEWEST_FEATURES, _FEATURE_BUDGET // len(photos)))
+    groups = _lens_groups(photos, sizes)
+    _extract_features(database, folder, groups, num_features, progress)
+    model = _best_model(database, folder, workdir, len(photos), seed, progress)
+    if model is None or model.num_reg_images() < 2:
+        raise _why_none_placed(database, len(photos))
+    decisions = refine_lenses(model)
+    _drop_bad_points(model)
+    _require_parallax(model)
+    return _placement(model, photos, decisions)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _LensGroup:
+    """Photographs that share one lens."""
+
+    names: tuple[str, ...]
+    width: int
+    height: int
+    focal_px: float | None
+
+
+def _picture_name(index: int) -> str:
+    return f"{index:04d}.png"
+
+
+def _picture_index(name: str) -> int:
+    return int(Path(name).stem)
+
+
+def _write_picture(photo: Photo, path: Path, max_side_px: int) -> tuple[int, int]:
+    """Write the photograph in grey, as large as wanted and there is; return its width and height."""
+    width, height = fitted_size(photo.original_width, photo.original_height, max_side_px)
+    image = photo.image_srgb
+    if image.shape[1] < width:
+        image = read_image(photo.path, max_side_px).image_srgb
+    elif image.shape[1] > width:
+        image = resized(image, width, height)
+    PIL.Image.fromarray(_grey(image)).save(path, compress_level=1)
+    return image.shape[1], image.shape[0]
+
+
+def _grey(image_srgb: Float32[np.ndarray, "height width 3"]) -> UInt8[np.ndarray, "height width"]:
+    luma = image_srgb @ np.array([0.299, 0.587, 0.114], np.float32)  # ITU-R BT.601
+    grey: UInt8[np.ndarray, "height width"] = np.rint(luma * 255).astype(np.uint8)
+    return grey
+
+
+def _lens_groups(photos: Sequence[Photo], sizes: Sequence[tuple[int, int]]) -> list[_LensGroup]:
+    """One group for each picture size and focal length: the same camera, not zoomed in between."""
+    members: dict[tuple[int, int, float | None], list[str]] = {}
+    for index, (photo, (width, height)) in enumerate(zip(photos, sizes, strict=True)):
+        focal_px = None
+        if photo.focal_px is not None:
+            focal_px = round(
+                photo.focal_px * max(width, height) / max(photo.original_width, photo.original_height), 1
+            )
+        members.setdefault((width, height, focal_px), []).append(_picture_name(index))
+    return [
+        _LensGroup(names=tuple(names), width=width, height=height, focal_px=focal_px)
+        for (width, height, focal_px), names in members.items()
+    ]
+
+
+def _num_threads() -> int:
+    return max(1, min(_MOST_THREADS, os.cpu_count() or 1))
+
+
+def _extract_features(
+    database: Path, folder: Path, groups: Sequence[_LensGroup], num_features: int, progress: Progress
+) -> None:
+    options = pycolmap.FeatureExtractionOptions()
+    options.use_gpu = False
+    options.num_threads = _num_threads()
+    options.sift.max_num_features = num_features
+    num_all = sum(len(group.names) for group in groups)
+    num_done = 0
+    for group in groups:
+        reader = pycolmap.ImageReaderOptions()
+        reader.camera_model = LENS_MODEL
+        reader.default_focal_length_factor = _UNKNOWN_FOCAL_FACTOR
+        if group.focal_px is not None:
+            reader.camera_params = f"{group.focal_px},{group.width / 2},{group.height / 2},0"
+        for names in _batches(group.names, options.num_threads):
+            progress(0.5 * num_done / num_all, "Finding features")
+            pycolmap.extract_features(
+                database,
+                folder,
+                image_names=list(names),
+                camera_mode=pycolmap.CameraMode.SINGLE,
+                reader_options=reader,
+                extraction_options=options,
+                device=pycolmap.Device.cpu,
+            )
+            # The next batch goes through the same lens.
+            reader.existing_camera_id = _camera_of(database, names[0])
+            num_done += len(names)
+
+
+def _batches(names: Sequence[str], size: int) -> list[Sequence[str]]:
+    return [names[start : start + size] for start in range(0, len(names), size)]
+
+
+def _camera_of(database: Path, name: str) -> int:
+    with pycolmap.Database.open(database) as opened:
+        image = opened.read_image_with_name(name)
+    if image is None:
+        raise ValueError(f"{name=} is not in {database}")
+    return int(image.camera_id)
+
+
+def _match(database: Path, guided: bool, seed: int) -> None:
+    with pycolmap.Database.open(database) as opened:
+        opened.clear_matches()
+        opened.clear_two_view_geometries()
+    matching = pycolmap.FeatureMatchingOptions()
+    matching.use_gpu = False
+    matching.guided_matching = guided
+    # Guided matching holds a full table of distances per thread.
+    matching.num_threads = 1 if guided else _num_threads()
+    verification = pycolmap.TwoViewGeometryOptions()
+    verification.ransac.random_seed = seed
+    pycolmap.match_exhaustive(
+        database,
+        matching_options=matching,
+        verification_options=verification,
+        device=pycolmap.Device.cpu,
+    )
+
+
+def _best_model(
+    database: Path, folder: Path, workdir: Path, num_photos: int, seed: int, progress: Progress
+) -> pycolmap.Reconstruction | None:
+    """The model with most photographs of all attempts; None where there is none at all."""
+    best: pycolmap.Reconstruction | None = None
+    matched_guided: bool | None = None
+    for number, attempt in enumerate(_ATTEMPTS):
+        if attempt.guided != matched_guided:
+            progress(0.5 + 0.1 * number, "Matching photographs")
+            _match(database, attempt.guided, seed)
+            matched_guided = attempt.guided
+        on_photo = partial(progress, 0.6 + 0.1 * number, "Placing cameras")
+        for model in _mapped(database, folder, workdir, attempt, seed, on_photo):
+            if best is None or _merit(model) > _merit(best):
+                best = model
+        if best is not None and best.num_reg_images() == num_photos:
+            break
+    return best
+
+
+def _merit(model: pycolmap.Reconstruction) -> tuple[int, int]:
+    return model.num_reg_images(), model.num_points3D()
+
+
+def _mapped(
+    database: Path,
+    folder: Path,
+    workdir: Path,
+    attempt: _Attempt,
+    seed: int,
+    on_photo: Callable[[], None],
+) -> list[pycolmap.Reconstruction]:
+    options = pycolmap.IncrementalPipelineOptions()
+    options.min_model_size = 2
+    options.extract_colors = False
+    # One thread: sums in another order would be another result.
+    options.num_threads = options.mapper.num_threads = 1
+    options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = seed
+    options.ba_local_function_tolerance = options.ba_global_function_tolerance = 1e-6
+    # With three photographs most features are seen by two of them.
+    options.triangulation.ignore_two_view_tracks = False
+    options.mapper.init_min_tri_angle = attempt.initial_angle_deg
+    options.mapper.init_min_num_inliers = attempt.initial_inliers
+    options.mapper.abs_pose_min_num_inliers = attempt.further_inliers
+    with pycolmap.Database.open(database) as opened:
+        known = {camera.camera_id for camera in opened.read_all_cameras() if camera.has_prior_focal_length}
+    # A focal length from EXIF is better than what two photographs can tell; refine_lenses weighs the two.
+    options.constant_cameras = options.mapper.constant_cameras = known
+    models = pycolmap.incremental_mapping(
+        database, folder, workdir, options, initial_image_pair_callback=on_photo, next_image_callback=on_photo
+    )
+    return list(models.values())
+
+
+def _why_none_placed(database: Path, num_photos: int) -> ReconstructionError:
+    """What the matches between pairs of photographs say about a failure."""
+    with pycolmap.Database.open(database) as opened:
+        _, geometries = opened.read_two_view_geometries()
+    kinds = pycolmap.TwoViewGeometryConfiguration
+    undone = {int(kinds.UNDEFINED), int(kinds.DEGENERATE)}
+    matched = [geometry.config for geometry in geometries if int(geometry.config) not in undone]
+    if not matched:
+        text = "The photographs have nothing in common that could be recognised."
+        remedy = "Take photographs that overlap by half, in steps of 10 to 20 degrees around the subject."
+        return ReconstructionError(ErrorCode.NO_OVERLAP, text, remedy)
+    flat = (kinds.PANORAMIC, kinds.PLANAR_OR_PANORAMIC, kinds.PLANAR)
+    if all(config in flat for config in matched):
+        return _no_parallax()
+    text = f"Fewer than 2 of {num_photos} photographs could be placed."
+    remedy = "Add photographs between those there are, or give the cameras."
+    return ReconstructionError(ErrorCode.TOO_FEW_PLACED, text, remedy)
+
+
+def _no_parallax() -> ReconstructionError:
+    text = "The photographs seem to be taken from one spot: nothing moves against its background."
+    remedy = "Walk around the subject; a step aside between photographs, not a turn."
+    return ReconstructionError(ErrorCode.NO_PARALLAX, text, remedy)
+
+
+def _drop_bad_points(model: pycolmap.Reconstruction) -> None:
+    """Delete points whose mean reprojection error, as last updated, is large."""
+    for point_id in [i for i, point in model.points3D.items() if point.error > _LARGEST_ERROR_PX]:
+        model.delete_point3D(point_id)
+
+
+def _require_parallax(model: pycolmap.Reconstruction) -> None:
+    angles_deg = widest_angles_deg(model)
+    if len(angles_deg) == 0 or float(np.median(angles_deg)) < _SMALLEST_ANGLE_DEG:
+        raise _no_parallax()
+
+
+def widest_angles_deg(model: pycolmap.Reconstruction) -> Float64[np.ndarray, "points"]:
+    """For each point, the widest angle between the rays to it."""
+    centres = {i: model.images[i].projection_center() for i in model.reg_image_ids()}
+    angles = []
+    for point in model.points3D.values():
+        rays = np.stack([centres[element.image_id] - point.xyz for element in point.track.elements])
+        rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+        angles.append(np.degrees(np.arccos(np.clip((rays @ rays.T).min(), -1.0, 1.0))))
+    return np.array(angles, np.float64)
+
+
+def _placement(
+    model: pycolmap.Reconstruction, photos: Sequence[Photo], decisions: tuple[Decision, ...]
+) -> Placement:
+    images = sorted((_picture_index(model.images[i].name), i) for i in model.reg_image_ids())
+    placed = tuple(
+        PlacedPhoto(
+            index=index,
+            lens=model.cameras[model.images[image_id].camera_id],
+            camera_from_world=rigid_matrix(model.images[image_id].cam_from_world()),
+        )
+        for index, image_id in images
+    )
+    positions, visibility = sparse_points(model, [image_id for _, image_id in images])
+    first = placed[0]
+    photo_px_per_picture_px = photos[first.index].image_srgb.shape[1] / first.lens.width
+    return Placement(
+        placed=placed,
+        sparse_positions=positions,
+        sparse_visibility=visibility,
+        reprojection_error_px=model.compute_mean_reprojection_error() * photo_px_per_picture_px,
+        decisions=decisions,
+    )

@@ -1,0 +1,219 @@
+"""The caller's side: start a backend, read what it says, stop it, and give its death a name.
+
+Whatever happens, exactly one `Finished` or `Failed` comes out, as the last message: a backend that ends
+without a last word gets a `Failed` made up from its exit code and the end of its log. Nothing here waits,
+so that a user interface can call it from a timer. Standard library only.
+"""
+
+import os
+import queue
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import IO, Any
+
+from .protocol import (
+    CRASHED,
+    PROTOCOL_BROKEN,
+    Cancel,
+    Failed,
+    Finished,
+    Hello,
+    Message,
+    ProtocolError,
+    decode,
+    encode,
+)
+
+ROOT = Path(__file__).resolve().parents[2]
+"""Folder that holds the package `backend`."""
+INTERRUPT_AFTER_S, TERMINATE_AFTER_S, KILL_AFTER_S = 10.0, 15.0, 20.0
+"""The ladder after a cancel line that is not obeyed."""
+_LOG_TAIL_BYTES = 2000
+
+_WINDOWS_CODES = {
+    0xC0000005: "a memory access violation",
+    0xC0000135: "a missing DLL",
+    0xC0000142: "a DLL that could not start",
+    0xC00000FD: "a stack overflow",
+    0xC0000017: "too little memory",
+}
+
+
+class BackendProcess:
+    """A running backend."""
+
+    def __init__(self, python: Path | str, arguments: Sequence[str], *, log_path: Path) -> None:
+        """Start `python -m backend ARGUMENTS`; its stderr goes to the log file.
+
+        Raises OSError where that Python cannot be started.
+        """
+        self._log_path = log_path
+        self._messages: queue.SimpleQueue[Message | ProtocolError | None] = queue.SimpleQueue()
+        self._cancelled_s: float | None = None
+        self._heard_hello = False
+        self._ended = False
+        with log_path.open("wb") as log:
+            self._process = subprocess.Popen(
+                [str(python), "-m", "backend", *arguments],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=log,
+                env=clean_environment(os.environ),
+                **_own_group(),
+            )
+        threading.Thread(target=self._read, name="backend reader", daemon=True).start()
+
+    @property
+    def is_running(self) -> bool:
+        """Whether the last message is still to come."""
+        return not self._ended
+
+    def poll(self) -> list[Message]:
+        """What the backend said since the last call; never waits."""
+        self._climb_ladder()
+        found: list[Message] = []
+        while not self._ended:
+            try:
+                item = self._messages.get_nowait()
+            except queue.Empty:
+                break
+            found.append(self._understood(item))
+            self._ended = isinstance(found[-1], Finished | Failed)
+        return found
+
+    def cancel(self) -> None:
+        """Ask the backend to stop; later calls of `poll` press harder where it does not."""
+        if self._cancelled_s is None:
+            self._cancelled_s = time.monotonic()
+            self._write(encode(Cancel()) + "\n")
+
+    def close(self, timeout_s: float = 3.0) -> None:
+        """End the backend now, by closing its stdin and, after the timeout, by force."""
+        self._ended = True
+        assert self._process.stdin is not None
+        with suppress(OSError):  # it is dead already
+            self._process.stdin.close()
+        try:
+            self._process.wait(timeout_s)
+        except subprocess.TimeoutExpired:
+            _kill_group(self._process)
+            self._process.wait()
+
+    def _understood(self, item: Message | ProtocolError | None) -> Message:
+        """The message; a Failed for the end of the stream or a line against the protocol."""
+        if item is None:
+            return describe_crash(self._process.wait(), _tail(self._log_path))
+        if isinstance(item, ProtocolError) or isinstance(item, Hello) == self._heard_hello:
+            _kill_group(self._process)
+            reason = item if isinstance(item, ProtocolError) else "the backend did not begin with one hello"
+            return Failed(
+                code=PROTOCOL_BROKEN,
+                text=f"The backend and its caller do not understand each other: {reason}.",
+                remedy="Install the backend and the add-on from the same version of FewView.",
+            )
+        self._heard_hello = True
+        return item
+
+    def _read(self) -> None:
+        """Put every message on the queue, and None at the end; runs in a thread of its own."""
+        assert self._process.stdout is not None
+        for line in self._process.stdout:
+            try:
+                self._messages.put(decode(line.decode("utf-8")))
+            except (ProtocolError, UnicodeDecodeError) as error:
+                self._messages.put(ProtocolError(str(error)))
+        self._process.wait()
+        self._process.stdout.close()
+        self._messages.put(None)
+
+    def _climb_ladder(self) -> None:
+        if self._cancelled_s is None or self._process.poll() is not None:
+            return
+        waited_s = time.monotonic() - self._cancelled_s
+        if waited_s > KILL_AFTER_S:
+            _kill_group(self._process)
+        elif waited_s > TERMINATE_AFTER_S:
+            self._process.terminate()
+        elif waited_s > INTERRUPT_AFTER_S:
+            self._process.send_signal(_INTERRUPT)
+
+    def _write(self, text: str) -> None:
+        stdin: IO[bytes] | None = self._process.stdin
+        assert stdin is not None
+        with suppress(OSError):  # it is dead, and the reader will say so
+            stdin.write(text.encode())
+            stdin.flush()
+
+
+def clean_environment(environment: Mapping[str, str]) -> dict[str, str]:
+    """The environment for a backend: the caller's own Python settings would lead another Python astray."""
+    kept = {k: v for k, v in environment.items() if not k.startswith(("PYTHON", "BLENDER_", "__PYVENV"))}
+    ours = {
+        "PYTHONPATH": str(ROOT),
+        "PYTHONSAFEPATH": "1",  # files beside the caller cannot pose as modules
+        "PYTHONUTF8": "1",
+        "PYTHONNOUSERSITE": "1",
+        "PYTHONUNBUFFERED": "1",
+    }
+    return {**kept, **ours}
+
+
+def describe_crash(exit_code: int, log_tail: str) -> Failed:
+    """What to say of a backend that ended without a last word."""
+    remedy = "Try a faster preset or fewer photographs; if it happens again, please report it with the log."
+    if -exit_code == getattr(signal, "SIGKILL", None) or exit_code == 137:
+        reason = "it was killed, most likely because the computer ran out of memory"
+    elif exit_code < 0:
+        reason = f"it was ended by the signal {_signal_name(-exit_code)}"
+    elif exit_code in _WINDOWS_CODES:
+        reason = f"it was ended by {_WINDOWS_CODES[exit_code]}"
+    else:
+        reason = f"it ended with exit code {exit_code}"
+        remedy = "Check the backend with `python -m backend doctor`."
+    log = f"\n{log_tail}" if log_tail else ""
+    return Failed(code=CRASHED, text=f"The backend ended without a result: {reason}.{log}", remedy=remedy)
+
+
+def _signal_name(number: int) -> str:
+    known = {member.value: member.name for member in signal.Signals}
+    return known.get(number, str(number))
+
+
+def _tail(path: Path) -> str:
+    """The end of the log, in whole lines."""
+    try:
+        data = path.read_bytes()
+    except OSError:
+        return ""
+    tail = data[-_LOG_TAIL_BYTES:]
+    if len(data) > len(tail):
+        tail = tail.partition(b"\n")[2]
+    return tail.decode("utf-8", "replace").strip()
+
+
+if sys.platform == "win32":
+    _INTERRUPT = signal.CTRL_BREAK_EVENT
+
+    def _own_group() -> dict[str, Any]:
+        """Popen options: no Ctrl-C of the caller reaches the backend, and no window opens."""
+        return {"creationflags": subprocess.CREATE_NEW_PROCESS_GROUP | subprocess.CREATE_NO_WINDOW}
+
+    def _kill_group(process: subprocess.Popen[bytes]) -> None:
+        subprocess.run(["taskkill", "/T", "/F", "/PID", str(process.pid)], check=False, capture_output=True)
+
+else:
+    _INTERRUPT = signal.SIGINT
+
+    def _own_group() -> dict[str, Any]:
+        """Popen options: no Ctrl-C of the caller reaches the backend."""
+        return {"start_new_session": True}
+
+    def _kill_group(process: subprocess.Popen[bytes]) -> None:
+        if process.poll() is None:  # else the number may belong to somebody else by now
+            os.killpg(process.pid, signal.SIGKILL)

@@ -1,0 +1,217 @@
+"""What the backend and its caller say to each other: one JSON object a line, decoded strictly.
+
+The backend speaks first: `Hello`, then any of `Stage`, `Progress`, `Preview`, `Warned`, `Heartbeat`,
+then exactly one `Finished` or `Failed`, which is the last line. The caller may write `Cancel`; closing
+the pipe says the same. Large data travels by file path. Standard library only: both sides import this
+one file, so neither can misspell the other.
+"""
+
+import json
+import types
+import typing
+from collections.abc import Callable
+from dataclasses import MISSING, asdict, dataclass, fields
+
+T = typing.TypeVar("T")
+
+PROTOCOL_VERSION = 1
+HEARTBEAT_S = 4.0
+"""Longest silence of a healthy backend; the promise to the caller is 5 s."""
+
+PRESETS = ("fast", "balanced", "detailed")
+DEVICES = ("auto", "cpu", "cuda", "mps")
+
+CANCELLED = "cancelled"
+"""Code of a `Failed` that the user asked for."""
+CRASHED = "crashed"
+"""Code of a `Failed` that the caller's side made up, because the backend ended without a last word."""
+PROTOCOL_BROKEN = "protocol_broken"
+"""Code of a `Failed` that the caller's side made up, because a line could not be understood."""
+
+
+class ProtocolError(ValueError):
+    """A line that this version of the protocol does not allow."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Job:
+    """One reconstruction, as the caller writes it to job.json; relative paths start at that file."""
+
+    protocol: int
+    images: tuple[str, ...]
+    """Image files, or folders of them."""
+    output: str
+    cameras: str | None = None
+    masks: str | None = None
+    preset: str = "balanced"
+    device: str = "auto"
+    seed: int = 0
+    truth: str | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Hello:
+    """First line."""
+
+    protocol: int
+    backend: str
+    """Version of the program."""
+    python: str
+    pid: int
+
+
+@dataclass(frozen=True, kw_only=True)
+class Stage:
+    """A stage begins; index counts from 1."""
+
+    name: str
+    index: int
+    count: int
+
+
+@dataclass(frozen=True, kw_only=True)
+class Progress:
+    """How far the stage is, 0 to 1; a later one replaces an earlier one."""
+
+    stage: str
+    fraction: float
+    text: str
+    remaining_s: float | None
+    """Estimated time to the end of the stage; None where nothing can be said yet."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Preview:
+    """A file that shows the result so far; it stays valid until the next one or the end."""
+
+    path: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class Warned:
+    """The run goes on, and the user should know this."""
+
+    text: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class Heartbeat:
+    """The backend lives; sent when nothing else is said for a while."""
+
+    elapsed_s: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class Finished:
+    """Last line of a run that gave a result; `files` are names inside `output`."""
+
+    output: str
+    files: tuple[str, ...]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Failed:
+    """Last line of a run that did not: a code of errors.py (or one above), a sentence and a remedy."""
+
+    code: str
+    text: str
+    remedy: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class Cancel:
+    """From the caller: stop, and keep what is done."""
+
+
+Message = Hello | Stage | Progress | Preview | Warned | Heartbeat | Finished | Failed | Cancel
+MESSAGES: dict[str, Callable[..., Message]] = {
+    kind.__name__.lower(): kind for kind in typing.get_args(Message)
+}
+
+
+def encode(message: Message) -> str:
+    """The message as one line, without the line break; ValueError on a number that is not finite."""
+    fields_of = {"type": type(message).__name__.lower(), **asdict(message)}
+    return json.dumps(fields_of, allow_nan=False, ensure_ascii=True)
+
+
+def decode(line: str) -> Message:
+    """The message of a line; ProtocolError unless it is exactly what `encode` writes."""
+    found = _json_object(line)
+    name = found.pop("type", None)
+    if not isinstance(name, str) or name not in MESSAGES:
+        raise ProtocolError(f"unknown message type {name!r}; known: {', '.join(MESSAGES)}")
+    kind = MESSAGES[name]
+    if kind is Hello:
+        check_version(found.get("protocol"))  # first: another version may have other fields
+    return _record(kind, found, name)
+
+
+def encode_job(job: Job) -> str:
+    """The content of job.json."""
+    return json.dumps(asdict(job), indent=2, allow_nan=False, ensure_ascii=True) + "\n"
+
+
+def decode_job(text: str) -> Job:
+    """The job of a job.json; ProtocolError with what is wrong otherwise."""
+    found = _json_object(text)
+    check_version(found.get("protocol"))
+    job = _record(Job, found, "job")
+    for name, value, known in (("preset", job.preset, PRESETS), ("device", job.device, DEVICES)):
+        if value not in known:
+            raise ProtocolError(f"job: {name} is {value!r}; known: {', '.join(known)}")
+    return job
+
+
+def check_version(found: object) -> None:
+    """ProtocolError when the other side speaks another version of the protocol."""
+    if found != PROTOCOL_VERSION or isinstance(found, bool):
+        raise ProtocolError(f"the other side speaks protocol {found!r}, this one {PROTOCOL_VERSION}")
+
+
+def _json_object(text: str) -> dict[str, object]:
+    """The JSON object of a text, without repeated keys and numbers that JSON does not have."""
+
+    def no_constant(name: str) -> object:
+        raise ProtocolError(f"{name} is not a JSON number")
+
+    def no_repeats(pairs: list[tuple[str, object]]) -> dict[str, object]:
+        if len(dict(pairs)) < len(pairs):
+            raise ProtocolError("a key is repeated")
+        return dict(pairs)
+
+    try:
+        found = json.loads(text, parse_constant=no_constant, object_pairs_hook=no_repeats)
+    except (json.JSONDecodeError, RecursionError) as error:
+        raise ProtocolError(f"not JSON: {text[:80]!r}") from error
+    if not isinstance(found, dict):
+        raise ProtocolError(f"not a JSON object: {text[:80]!r}")
+    return found
+
+
+def _record(kind: Callable[..., T], found: dict[str, object], name: str) -> T:
+    """A record of the given dataclass with exactly its fields, each of the annotated type."""
+    hints = typing.get_type_hints(kind)
+    missing = [f.name for f in fields(typing.cast(typing.Any, kind)) if f.default is MISSING]
+    missing = [field for field in missing if field not in found]
+    unknown = [field for field in found if field not in hints]
+    if missing or unknown:
+        raise ProtocolError(f"{name}: missing {missing}, unknown {unknown}; known: {list(hints)}")
+    return kind(**{field: _value(hints[field], value, f"{name}.{field}") for field, value in found.items()})
+
+
+def _value(hint: object, value: object, where: str) -> object:
+    """The value as the annotation asks for it; nothing is converted except a list into a tuple."""
+    if isinstance(hint, types.UnionType):
+        (hint,) = (part for part in typing.get_args(hint) if part is not types.NoneType)
+        return None if value is None else _value(hint, value, where)
+    if typing.get_origin(hint) is tuple:
+        if not isinstance(value, list):
+            raise ProtocolError(f"{where} is {value!r}, expected a list")
+        item_hint = typing.get_args(hint)[0]
+        return tuple(_value(item_hint, item, where) for item in value)
+    if hint is float and type(value) is int:
+        return float(value)  # JSON writers may drop the ".0"
+    if type(value) is not hint:  # exact: a bool is no int
+        raise ProtocolError(f"{where} is {value!r}, expected {getattr(hint, '__name__', hint)}")
+    return value

@@ -1,0 +1,253 @@
+"""The output folder: whose it is, what is finished in it, and how results appear there.
+
+    DIR/                      results, all put in place together at the end; log.txt
+    DIR/.fewview/             format.json (the sign that the folder is ours), one `<stage>.npz` for each
+                              finished stage with the fingerprint of all it depends on, lock, sfm/
+
+Nothing outside of these names is ever written, replaced or removed.
+"""
+
+import errno
+import hashlib
+import json
+import logging
+import shutil
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import BinaryIO, TypeVar
+
+from .errors import ErrorCode, ReconstructionError
+from .failures import is_disk_full
+from .records import RecordUnreadable, load_record, read_note, save_record
+
+T = TypeVar("T")
+FORMAT = 1
+PRIVATE = ".fewview"
+LOG = "log.txt"
+_FORMAT_FILE = "format.json"
+_LOCK = "lock"
+_PARTS = "results"
+_SFM = "sfm"
+_NOBODYS = frozenset({".DS_Store", "Thumbs.db", "desktop.ini"})
+"""Files that file browsers leave behind."""
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, kw_only=True)
+class StageCost:
+    """What a stage took when it was computed."""
+
+    seconds: float
+    peak_memory_bytes: int | None
+    """Of the process until the end of the stage; None where the system does not tell."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Workspace:
+    """An output folder that is ours and locked."""
+
+    folder: Path
+
+    @property
+    def private(self) -> Path:
+        """Folder of the checkpoints."""
+        return self.folder / PRIVATE
+
+    @property
+    def log_path(self) -> Path:
+        """Where the log of all runs is."""
+        return self.folder / LOG
+
+    @property
+    def preview_path(self) -> Path:
+        """Where the points are to be seen while the surface is not there yet."""
+        return self.private / "preview.ply"
+
+    def emptied_sfm_folder(self) -> Path:
+        """Scratch folder for the camera solver, without what a killed run may have left in it."""
+        folder = self.private / _SFM
+        shutil.rmtree(folder, ignore_errors=True)
+        folder.mkdir()
+        return folder
+
+    def is_finished(self, stage: str, fingerprint: str) -> bool:
+        """Whether the stage was finished from exactly the same inputs."""
+        note = read_note(self._stage_path(stage))
+        return note is not None and note.split(" ")[0] == fingerprint
+
+    def save(self, stage: str, fingerprint: str, record: object, hint: object, cost: StageCost) -> None:
+        """Keep the result of a stage."""
+        memory = cost.peak_memory_bytes
+        note = f"{fingerprint} {cost.seconds:.6f} {'-' if memory is None else memory}"
+        save_record(self._stage_path(stage), record, hint, note=note)
+
+    def load_or_none(self, stage: str, fingerprint: str, hint: type[T]) -> tuple[T, StageCost] | None:
+        """The result of a stage that was finished from the same inputs; None where it must be redone."""
+        if not self.is_finished(stage, fingerprint):
+            return None
+        path = self._stage_path(stage)
+        try:
+            _, seconds, memory = (read_note(path) or "").split(" ")
+            cost = StageCost(seconds=float(seconds), peak_memory_bytes=None if memory == "-" else int(memory))
+            return load_record(path, hint), cost
+        except (RecordUnreadable, ValueError) as error:
+            logger.warning("the checkpoint of stage %s is damaged and is redone: %s", stage, error)
+            return None
+
+    def write_results(self, writers: dict[str, Callable[[Path], object]]) -> None:
+        """Write every result under another name, then put all in place together."""
+        parts = self.private / _PARTS
+        shutil.rmtree(parts, ignore_errors=True)
+        parts.mkdir()
+        for name, write in writers.items():
+            write(parts / name)
+        for name in writers:
+            (parts / name).replace(self.folder / name)
+        parts.rmdir()
+
+    def discard_if_nothing_done(self) -> None:
+        """Remove what opening made, where no stage was finished and nothing else is there."""
+        if any(self.private.glob("*.npz")):
+            return
+        if {entry.name for entry in self.folder.iterdir()} - {PRIVATE, LOG}:
+            return
+        shutil.rmtree(self.private, ignore_errors=True)  # Windows keeps the lock until the run ends
+        self.log_path.unlink(missing_ok=True)
+        with suppress(OSError):
+            self.folder.rmdir()
+
+    def _stage_path(self, stage: str) -> Path:
+        return self.private / f"{stage}.npz"
+
+
+@contextmanager
+def open_workspace(folder: Path) -> Iterator[Workspace]:
+    """The output folder, made where it is missing and locked against a second run.
+
+    Raises ReconstructionError(OUTPUT_UNUSABLE) and touches nothing where the folder is a file, holds
+    somebody's files, was made by another format, cannot be written or is in use.
+    """
+    _check_ours(folder)
+    private = folder / PRIVATE
+    try:
+        private.mkdir(parents=True, exist_ok=True)
+        lock = (private / _LOCK).open("ab")
+    except OSError as error:
+        raise _not_writable(folder, error) from error
+    with lock:
+        if not _locked(lock):
+            raise ReconstructionError(
+                ErrorCode.OUTPUT_UNUSABLE,
+                f"Another run is writing to {folder}.",
+                "Wait until it ends, or choose another output folder.",
+            )
+        try:
+            marker = private / (_FORMAT_FILE + ".part")
+            marker.write_text(json.dumps({"program": "fewview", "format": FORMAT}) + "\n")
+            marker.replace(private / _FORMAT_FILE)
+        except OSError as error:
+            raise _not_writable(folder, error) from error
+        yield Workspace(folder=folder)
+
+
+def check_free_space(folder: Path, needed_bytes: int) -> None:
+    """ReconstructionError(DISK_FULL) where the disk of the folder has less than that free."""
+    free = shutil.disk_usage(folder).free
+    if free < needed_bytes:
+        raise ReconstructionError(
+            ErrorCode.DISK_FULL,
+            f"{free / 1e9:.1f} GB are free on the disk of {folder}; "
+            f"this run needs about {needed_bytes / 1e9:.1f} GB.",
+            "Free some space, choose an output folder on another disk, or use a faster preset.",
+        )
+
+
+def fingerprint(*parts: object) -> str:
+    """A short name of the parts' representations and of the content of those that are paths."""
+    digest = hashlib.sha256()
+    for part in parts:
+        if isinstance(part, Path):
+            for path in _files_of(part):
+                digest.update(f"\0file {path.name}\0".encode())
+                with path.open("rb") as file:
+                    digest.update(hashlib.file_digest(file, "sha256").digest())
+        else:
+            digest.update(f"\0{part!r}\0".encode())
+    return digest.hexdigest()[:32]
+
+
+def _files_of(path: Path) -> list[Path]:
+    """The file, or the files right in the folder; none where there is nothing."""
+    if path.is_dir():
+        return sorted(entry for entry in path.iterdir() if entry.is_file())
+    return [path] if path.is_file() else []
+
+
+def _check_ours(folder: Path) -> None:
+    """ReconstructionError(OUTPUT_UNUSABLE) where writing into the folder could hurt somebody's files."""
+    remedy = "Choose a new or empty folder for --output."
+    try:
+        if not folder.exists():
+            return
+        if not folder.is_dir():
+            raise ReconstructionError(ErrorCode.OUTPUT_UNUSABLE, f"{folder} is a file, not a folder.", remedy)
+        names = sorted({entry.name for entry in folder.iterdir()} - _NOBODYS)
+    except OSError as error:
+        raise _not_writable(folder, error) from error
+    private = folder / PRIVATE
+    marker = private / _FORMAT_FILE
+    unmarked = set() if not private.is_dir() else {entry.name for entry in private.iterdir()}
+    if not names or (names == [PRIVATE] and unmarked <= {_LOCK, _FORMAT_FILE + ".part"}):
+        return
+    if not marker.is_file():
+        shown = ", ".join(names[:3]) + (", ..." if len(names) > 3 else "")
+        raise ReconstructionError(
+            ErrorCode.OUTPUT_UNUSABLE, f"{folder} holds files that FewView did not make ({shown}).", remedy
+        )
+    try:
+        found = json.loads(marker.read_text()).get("format")
+    except (OSError, ValueError, AttributeError):
+        found = None
+    if found != FORMAT:
+        raise ReconstructionError(
+            ErrorCode.OUTPUT_UNUSABLE, f"{folder} was made by another version of FewView.", remedy
+        )
+
+
+def _not_writable(folder: Path, error: OSError) -> Exception:
+    """What to raise for an error of the file system; a full disk stays what it is."""
+    if is_disk_full(error):
+        return error
+    return ReconstructionError(
+        ErrorCode.OUTPUT_UNUSABLE,
+        f"{folder} cannot be written ({error.strerror or error}).",
+        "Choose a folder for --output that you may write to.",
+    )
+
+
+if sys.platform == "win32":
+    import msvcrt
+
+    def _locked(file: BinaryIO) -> bool:
+        """Whether the file is now locked by this process; the system unlocks it when the process ends."""
+        try:
+            msvcrt.locking(file.fileno(), msvcrt.LK_NBLCK, 1)
+        except OSError:
+            return False
+        return True
+
+else:
+    import fcntl
+
+    def _locked(file: BinaryIO) -> bool:
+        """Whether the file is now locked by this process; the system unlocks it when the process ends."""
+        try:
+            fcntl.flock(file.fileno(), fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            # Some network drives know no locks: a run there is better than none.
+            return error.errno not in (errno.EWOULDBLOCK, errno.EACCES)
+        return True

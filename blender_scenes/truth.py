@@ -1,0 +1,124 @@
+"""The true surface of a scene, and what exact cameras see of it."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import bpy
+import numpy as np
+from mathutils import Vector
+from mathutils.bvhtree import BVHTree
+from numpy.typing import NDArray
+
+from .view_layout import Lens
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrueMesh:
+    """Triangles in the world frame, counter-clockwise seen from outside."""
+
+    vertices: NDArray[np.float64]
+    """(vertices, 3), metres."""
+    normals: NDArray[np.float64]
+    """(vertices, 3), unit."""
+    faces: NDArray[np.int32]
+    """(faces, 3)."""
+
+
+def true_mesh(objects: tuple[Any, ...]) -> TrueMesh:
+    """The objects as they are rendered, all modifiers applied, in one mesh."""
+    bpy.context.view_layer.update()
+    depsgraph = bpy.context.evaluated_depsgraph_get()
+    parts = [_evaluated(made.evaluated_get(depsgraph)) for made in objects]
+    first_vertex = np.cumsum([0] + [len(part.vertices) for part in parts])
+    return TrueMesh(
+        vertices=np.concatenate([part.vertices for part in parts]),
+        normals=np.concatenate([part.normals for part in parts]),
+        faces=np.concatenate(
+            [part.faces + np.int32(first) for part, first in zip(parts, first_vertex, strict=False)]
+        ),
+    )
+
+
+def _evaluated(made: Any) -> TrueMesh:
+    mesh = made.to_mesh()
+    mesh.calc_loop_triangles()
+    vertices = np.empty(len(mesh.vertices) * 3, np.float32)
+    normals = np.empty(len(mesh.vertices) * 3, np.float32)
+    faces = np.empty(len(mesh.loop_triangles) * 3, np.int32)
+    mesh.vertices.foreach_get("co", vertices)
+    mesh.vertex_normals.foreach_get("vector", normals)
+    mesh.loop_triangles.foreach_get("vertices", faces)
+    made.to_mesh_clear()
+    world_from_object = np.array(made.matrix_world, np.float64)
+    vertices_world = vertices.reshape(-1, 3) @ world_from_object[:3, :3].T + world_from_object[:3, 3]
+    # Normals are covectors: they go with the inverse transpose.
+    normals_world = normals.reshape(-1, 3) @ np.linalg.inv(world_from_object[:3, :3])
+    normals_world /= np.maximum(np.linalg.norm(normals_world, axis=1, keepdims=True), np.finfo(float).tiny)
+    triangles = faces.reshape(-1, 3)
+    if np.linalg.det(world_from_object[:3, :3]) < 0:  # a mirror turns the triangles round
+        triangles = triangles[:, ::-1]
+    if signed_volume(vertices_world, triangles) < 0:
+        triangles, normals_world = triangles[:, ::-1], -normals_world
+    return TrueMesh(vertices=vertices_world, normals=normals_world, faces=triangles)
+
+
+def signed_volume(vertices: NDArray[np.float64], faces: NDArray[np.int32]) -> float:
+    """Volume in cubic metres, positive where the triangles face outwards; about the centre where open."""
+    corners = (vertices - vertices.mean(axis=0))[faces]
+    return float(np.einsum("fi,fi->", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])) / 6.0)
+
+
+def bounding_sphere(mesh: TrueMesh) -> tuple[NDArray[np.float64], float]:
+    """Centre of the bounding box and distance of the farthest vertex from it."""
+    centre = (mesh.vertices.min(axis=0) + mesh.vertices.max(axis=0)) / 2
+    return centre, float(np.linalg.norm(mesh.vertices - centre, axis=1).max())
+
+
+def write_ply(path: Path, mesh: TrueMesh) -> None:
+    """Binary PLY with vertex normals; float32 coordinates."""
+    vertex = np.hstack([mesh.vertices, mesh.normals]).astype("<f4")
+    face = np.empty(len(mesh.faces), dtype=[("count", "u1"), ("corners", "<i4", 3)])
+    face["count"], face["corners"] = 3, mesh.faces
+    properties = "".join(f"property float {name}\n" for name in ("x", "y", "z", "nx", "ny", "nz"))
+    header = (
+        f"ply\nformat binary_little_endian 1.0\nelement vertex {len(vertex)}\n{properties}"
+        f"element face {len(face)}\nproperty list uchar int vertex_indices\nend_header\n"
+    )
+    path.write_bytes(header.encode("ascii") + vertex.tobytes() + face.tobytes())
+
+
+def ray_caster(mesh: TrueMesh) -> BVHTree:
+    """A search tree over the triangles."""
+    return BVHTree.FromPolygons(mesh.vertices.tolist(), mesh.faces.tolist(), all_triangles=True)
+
+
+def depth_and_normals(
+    tree: BVHTree, lens: Lens, world_from_camera: NDArray[np.float64]
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """What the camera sees through the centre of each pixel.
+
+    (height, width) depth along the optical axis in metres, inf where nothing; (height, width, 3)
+    normals of the triangles that were hit, world frame, 0 where nothing. Rays are cast rather than
+    passes rendered: a pass mixes surfaces at edges and is read back differently in every Blender.
+    """
+    columns, rows = np.meshgrid(np.arange(lens.width) + 0.5, np.arange(lens.height) + 0.5)
+    in_camera = np.stack(
+        [
+            (columns - lens.width / 2) / lens.focal_px,
+            -(rows - lens.height / 2) / lens.focal_px,
+            -np.ones_like(rows),
+        ],
+        axis=-1,
+    ).reshape(-1, 3)
+    lengths = np.linalg.norm(in_camera, axis=1)
+    in_world = (in_camera / lengths[:, None]) @ world_from_camera[:3, :3].T
+    origin = Vector(world_from_camera[:3, 3])
+    depth = np.full(len(in_world), np.inf, np.float32)
+    normals = np.zeros((len(in_world), 3), np.float32)
+    for pixel, direction in enumerate(in_world.tolist()):
+        _, normal, _, distance = tree.ray_cast(origin, direction)
+        if distance is not None:
+            depth[pixel] = distance / lengths[pixel]
+            normals[pixel] = normal
+    return depth.reshape(lens.height, lens.width), normals.reshape(lens.height, lens.width, 3)

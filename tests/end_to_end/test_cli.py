@@ -1,0 +1,523 @@
+"""The command line from outside: every command as a process, its words, its exit code and its files.
+
+Where a run must be slow, broken or quick on purpose, small stages stand in for the real ones.
+"""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from backend.mesh_files import read_mesh
+from backend.wire import protocol
+from backend.wire.client import BackendProcess, clean_environment
+from backend.wire.protocol import Failed, Finished, Hello, Job, Message, decode
+
+ROOT = Path(__file__).resolve().parents[2]
+STAGES = ["photos", "cameras", "region", "stereo", "train", "mesh"]
+RESULTS = {"mesh.ply", "mesh.glb", "points.ply", "cameras.json", "log.txt"}
+posix_only = pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX")
+
+FAKE_STAGES = """
+import dataclasses, os, sys, time
+from pathlib import Path
+import numpy as np, torch
+from backend import pipeline
+from backend.scene import *
+
+TROUBLE, WHERE, STEP_S = sys.argv[1], sys.argv[2], float(sys.argv[3])
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class FakeStereo:
+    points: SurfacePoints
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class FakeSurface:
+    values: np.ndarray
+
+def work(name, progress):
+    print("noise of a library", name)
+    os.write(1, b"noise of a C library\\\\n")
+    with open(os.environ["DONE_LOG"], "a") as log:
+        log.write(name + "\\\\n")
+    for step in range(10):
+        progress(step / 10, f"{name} {step}")
+        time.sleep(STEP_S)
+        if name == WHERE and step == 5:
+            {"none": lambda: None, "internal": lambda: 1 / 0, "memory": fail_memory, "torch_memory": fail_torch,
+             "disk": fail_disk, "import": fail_import, "hang": lambda: time.sleep(60)}[TROUBLE]()
+
+def fail_memory(): raise MemoryError
+def fail_torch(): raise RuntimeError("[enforce fail at alloc_cpu.cpp:117] err == 0. DefaultCPUAllocator: can't allocate memory")
+def fail_disk(): raise OSError(28, "No space left on device")
+def fail_import(): raise ImportError("No module named 'pycolmap'", name="pycolmap")
+
+def load_photos(sources, masks, config, *, progress) -> tuple[Photo, ...]:
+    work("photos", progress)
+    image = np.zeros((4, 6, 3), np.float32)
+    return tuple(
+        Photo(name=p.name, path=p, image_srgb=image, mask=None, original_width=6, original_height=4, focal_px=None)
+        for p in sorted(sources[0].iterdir())
+    )
+
+def solve_cameras(photos, given, config, *, workdir, seed, progress) -> SolvedCameras:
+    (workdir / "database").touch()
+    work("cameras", progress)
+    camera = Camera(camera_from_world=np.eye(4), fx_px=5.0, fy_px=5.0, cx_px=3.0, cy_px=2.0, width=6, height=4)
+    views = tuple(View(name=p.name, camera=camera, image_srgb=p.image_srgb, mask=None) for p in photos[1:])
+    return SolvedCameras(views=views, unplaced=(photos[0].name,), estimated=True,
+        sparse_positions=np.zeros((0, 3)), sparse_visibility=np.zeros((0, len(views)), bool), reprojection_error_px=None)
+
+def find_region(solved, config, *, progress) -> Region:
+    work("region", progress)
+    return Region(object_from_world=np.eye(4))
+
+def match_views(views, region, config, *, device, progress) -> FakeStereo:
+    work("stereo", progress)
+    ones = np.ones((5, 3), np.float32)
+    return FakeStereo(points=SurfacePoints(positions=ones, normals=ones, colours_srgb=ones, confidence=ones[:, 0],
+        num_views=np.full(5, 2), view_index=np.zeros(5, np.int64)))
+
+def fit_surface(views, region, stereo, config, *, device, generator, progress) -> FakeSurface:
+    work("train", progress)
+    return FakeSurface(values=torch.rand(3, generator=generator, device=device).cpu().numpy())
+
+def extract_mesh(views, region, stereo, surface, config, *, device, progress) -> SurfaceMesh:
+    work("mesh", progress)
+    vertices = np.eye(3) * surface.values
+    return SurfaceMesh(vertices=vertices, faces=np.array([[0, 1, 2]]), normals=vertices.astype(np.float32),
+        colours_srgb=np.zeros((3, 3), np.uint8), support=np.ones(3, np.float32))
+
+pipeline.STAGES = dataclasses.replace(pipeline.STAGES, load_photos=load_photos, solve_cameras=solve_cameras,
+    find_region=find_region, match_views=match_views, fit_surface=fit_surface, extract_mesh=extract_mesh)
+from backend.__main__ import main
+sys.exit(main(sys.argv[4:]))
+""".replace("\\\\", "\\")
+
+
+class Case:
+    """A folder with photographs, a place for results, and commands run on them."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.output = folder / "out"
+        self.photos = folder / "photos"
+        self.photos.mkdir()
+        for index in range(3):
+            Image.fromarray(np.full((4, 6, 3), 50 * index, np.uint8)).save(self.photos / f"{index}.png")
+        (folder / "fake.py").write_text(FAKE_STAGES)
+
+    @property
+    def environment(self) -> dict[str, str]:
+        return {
+            **clean_environment(os.environ),
+            "DONE_LOG": str(self.folder / "done"),
+            "OMP_NUM_THREADS": "1",
+        }
+
+    def command(self, trouble: str = "none", where: str = "none", step_s: float = 0.0) -> list[str]:
+        return [sys.executable, str(self.folder / "fake.py"), trouble, where, str(step_s), "reconstruct"]
+
+    def options(self, *more: str) -> list[str]:
+        return [str(self.photos), "--output", str(self.output), "--device", "cpu", *more]
+
+    def run(self, trouble: str = "none", where: str = "none", *more: str) -> subprocess.CompletedProcess[str]:
+        """A run on a terminal that is none, so with plain lines."""
+        return self.finish(self.command(trouble, where) + self.options(*more))
+
+    def finish(self, command: list[str], **options: Any) -> subprocess.CompletedProcess[str]:
+        options = {"capture_output": True, "text": True, "timeout": 60, "cwd": self.folder, **options}
+        return subprocess.run(command, env=self.environment, check=False, **options)
+
+    def start(self, step_s: float, *arguments: str, **options: Any) -> subprocess.Popen[str]:
+        command = self.command(step_s=step_s) + list(arguments)
+        pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+        return subprocess.Popen(command, env=self.environment, text=True, cwd=self.folder, **pipes, **options)
+
+    def done(self) -> list[str]:
+        """Stages computed since the last call."""
+        path = self.folder / "done"
+        lines = path.read_text().split() if path.exists() else []
+        path.unlink(missing_ok=True)
+        return lines
+
+    def wait_for_stage(self, name: str) -> None:
+        deadline = time.monotonic() + 30
+        while time.monotonic() < deadline:
+            if (self.folder / "done").exists() and name in (self.folder / "done").read_text():
+                return
+            time.sleep(0.01)
+        raise AssertionError(f"stage {name} never began")
+
+    def write_job(self, **changes: object) -> Path:
+        job = Job(protocol=protocol.PROTOCOL_VERSION, images=("photos",), output="out", device="cpu")
+        content = {**json.loads(protocol.encode_job(job)), **changes}
+        (self.folder / "job.json").write_text(json.dumps(content))
+        return self.folder / "job.json"
+
+    def results(self) -> dict[str, bytes]:
+        return {path.name: path.read_bytes() for path in self.output.iterdir() if path.is_file()}
+
+
+@pytest.fixture
+def case() -> Iterator[Case]:
+    with tempfile.TemporaryDirectory() as folder:
+        yield Case(Path(folder).resolve())
+
+
+def backend(*arguments: str, **options: Any) -> subprocess.CompletedProcess[str]:
+    options = {"capture_output": True, "text": True, "timeout": 120, "cwd": ROOT, **options}
+    return subprocess.run([sys.executable, "-m", "backend", *arguments], check=False, **options)
+
+
+def messages(text: str) -> list[Message]:
+    """The lines of a conversation, checked for its rules."""
+    heard = [decode(line) for line in text.splitlines()]
+    assert isinstance(heard[0], Hello)
+    assert not any(isinstance(message, Hello) for message in heard[1:])
+    assert [isinstance(message, Finished | Failed) for message in heard] == [False] * (len(heard) - 1) + [
+        True
+    ]
+    return heard
+
+
+# Commands that reconstruct nothing.
+
+
+def test_doctor_says_ready() -> None:
+    result = backend("doctor")
+    assert (result.returncode, result.stdout.splitlines()[-1]) == (0, "ready"), result.stderr
+    found = json.loads(backend("doctor", "--json").stdout)
+    assert found["ready"] is True
+    assert {"torch", "pycolmap", "cpu"} <= {check["name"] for check in found["checks"]}
+
+
+def without_packages(*arguments: str) -> subprocess.CompletedProcess[str]:
+    """The command line in a Python without any installed package."""
+    command = [sys.executable, "-S", "-m", "backend", *arguments]
+    return subprocess.run(
+        command, cwd=ROOT, capture_output=True, text=True, timeout=60, check=False, input=""
+    )
+
+
+def test_doctor_starts_without_any_package_and_names_them() -> None:
+    result = without_packages("doctor")
+    assert result.returncode == 2, result.stderr
+    assert "NOT torch" in result.stdout
+    assert "pip install" in result.stdout.splitlines()[-1]
+    assert json.loads(without_packages("doctor", "--json").stdout)["ready"] is False
+
+
+def test_a_missing_package_is_a_clear_error(case: Case) -> None:
+    result = without_packages("reconstruct", str(case.photos), "--output", str(case.output))
+    assert result.returncode == 2
+    assert "cannot be loaded" in result.stderr
+    assert "doctor" in result.stderr
+    assert "Traceback" not in result.stderr
+    last = messages(without_packages("reconstruct", str(case.write_job())).stdout)[-1]
+    assert isinstance(last, Failed)
+    assert last.code == "missing_dependency"
+    assert not case.output.exists()
+
+
+def test_rehearse_plays_the_whole_conversation_without_any_package(case: Case) -> None:
+    command = [sys.executable, "-S", "-m", "backend", "rehearse", "--output", str(case.output)]
+    with subprocess.Popen(
+        command, cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as process:
+        assert process.stdout is not None
+        heard = messages(process.stdout.read())
+    assert {type(message) for message in heard} == {
+        kind for name, kind in protocol.MESSAGES.items() if name not in ("cancel", "failed")
+    }
+    assert isinstance(heard[-1], Finished)
+    assert all((case.output / name).exists() for name in heard[-1].files)
+
+
+def test_the_client_and_a_rehearsal_understand_each_other(case: Case) -> None:
+    process = BackendProcess(sys.executable, ["rehearse"], log_path=case.folder / "log")
+    heard: list[Message] = []
+    while process.is_running:
+        heard += process.poll()
+        if len(heard) == 10:
+            process.cancel()
+        time.sleep(0.005)
+    process.close()
+    assert isinstance(heard[-1], Failed)
+    assert heard[-1].code == protocol.CANCELLED
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        [],
+        ["reconstruct"],
+        ["reconstruct", "photos"],
+        ["reconstruct", "job.json", "--seed", "1"],
+        ["reconstruct", "photos", "--output", "out", "--preset", "best"],
+        ["reconstruct", "photos", "--output", "out", "--device", "tpu"],
+        ["reconstruct", "photos", "--output", "out", "--seed", "-1"],
+        ["reconstruct", "photos", "--output", "out", "--seed", "x"],
+    ],
+)
+def test_wrong_arguments_end_with_usage(arguments: list[str], tmp_path: Path) -> None:
+    result = backend(*arguments)
+    assert result.returncode == 2
+    assert "usage:" in result.stderr
+
+
+# Runs.
+
+
+def test_a_run_leaves_its_results_and_the_next_one_resumes(case: Case) -> None:
+    first = case.run()
+    assert first.returncode == 0, first.stderr
+    assert case.done() == STAGES
+    results = case.results()
+    assert set(results) >= RESULTS
+    assert {
+        Path(line).name for line in first.stdout.splitlines() if line.startswith(str(case.output))
+    } >= RESULTS
+    assert "noise" not in first.stdout.splitlines()[-1]
+    assert "Warning: 1 of 3 photographs could not be placed: 0.png." in first.stderr
+    assert "[4/7] stereo done in" in first.stderr
+    assert len(read_mesh(case.output / "mesh.ply").faces) == 1
+    second = case.run()
+    assert "Resuming: photos, cameras, region, stereo, train, mesh are done" in second.stderr
+    assert case.done() == []
+    assert {**case.results(), "log.txt": b""}.keys() == results.keys()
+    assert (case.output / "mesh.ply").read_bytes() == results["mesh.ply"]
+
+
+def test_what_depends_on_a_change_is_redone_and_nothing_else(case: Case) -> None:
+    case.run()
+    mesh = (case.output / "mesh.ply").read_bytes()
+    case.done()
+    again = case.run("none", "none", "--seed", "7")
+    assert "Resuming: photos is done" in again.stderr
+    assert case.done() == STAGES[1:]
+    assert (case.output / "mesh.ply").read_bytes() != mesh
+    Image.fromarray(np.full((4, 6, 3), 99, np.uint8)).save(case.photos / "1.png")
+    assert "Resuming" not in case.run("none", "none", "--seed", "7").stderr
+    assert case.done() == STAGES
+    case.run()
+    assert (case.output / "mesh.ply").read_bytes() == mesh  # the seed alone decides
+
+
+def test_a_damaged_checkpoint_is_redone(case: Case) -> None:
+    case.run()
+    case.done()
+    path = case.output / ".fewview" / "stereo.npz"
+    data = bytearray(path.read_bytes())
+    data[200] ^= 255
+    path.write_bytes(data)
+    assert case.run().returncode == 0
+    assert case.done() == ["stereo"]
+
+
+@pytest.mark.parametrize(
+    ("trouble", "code", "words"),
+    [
+        ("memory", 2, "ran out of memory"),
+        ("torch_memory", 2, "ran out of memory"),
+        ("disk", 2, "disk is full"),
+        ("import", 2, "pycolmap"),
+        ("internal", 1, "ZeroDivisionError"),
+    ],
+)
+def test_trouble_is_told_and_what_was_done_is_kept(case: Case, trouble: str, code: int, words: str) -> None:
+    result = case.run(trouble, "stereo")
+    assert result.returncode == code
+    assert words in result.stderr
+    assert ("Traceback" in result.stderr) is (code == 1)
+    assert set(case.results()) == {"log.txt"}
+    assert "Traceback" in (case.output / "log.txt").read_text()
+    assert case.done() == STAGES[:4]
+    assert "Resuming: photos, cameras, region are done" in case.run().stderr
+    assert case.done() == STAGES[3:]
+
+
+def test_trouble_leaves_earlier_results_as_they_were(case: Case) -> None:
+    case.run()
+    before = case.results()
+    assert case.run("disk", "mesh", "--seed", "3").returncode == 2
+    after = case.results()
+    assert {**after, "log.txt": b""} == {**before, "log.txt": b""}
+
+
+def test_someone_elses_folder_is_not_touched(case: Case) -> None:
+    before = {path: path.stat().st_mtime_ns for path in [case.photos, *case.photos.iterdir()]}
+    result = case.finish([*case.command(), str(case.photos), "--output", str(case.photos)])
+    assert result.returncode == 2
+    assert "did not make" in result.stderr
+    assert {path: path.stat().st_mtime_ns for path in [case.photos, *case.photos.iterdir()]} == before
+
+
+def test_a_missing_truth_is_told_before_the_work(case: Case) -> None:
+    result = case.run("none", "none", "--truth", str(case.folder / "none.ply"))
+    assert result.returncode == 2
+    assert "none.ply" in result.stderr
+    assert case.done() == []
+    assert not case.output.exists()
+
+
+@pytest.mark.skipif(sys.platform == "darwin", reason="a Mac has it")
+def test_a_device_that_is_not_there_is_told(case: Case) -> None:
+    result = case.finish([*case.command(), str(case.photos), "--output", str(case.output), "--device", "mps"])
+    assert result.returncode == 2
+    assert "mps" in result.stderr
+    assert not case.output.exists()
+
+
+# Ends that come from outside.
+
+
+@posix_only
+def test_a_killed_run_resumes(case: Case) -> None:
+    process = case.start(0.02, *case.options())
+    case.wait_for_stage("stereo")
+    process.kill()
+    process.communicate()
+    assert case.done() == STAGES[:4]
+    assert not RESULTS & {path.name for path in case.output.glob("*.*")} - {"log.txt"}
+    result = case.run()
+    assert result.returncode == 0
+    assert "Resuming: photos, cameras, region are done" in result.stderr
+    assert case.done() == STAGES[3:]
+
+
+@posix_only
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_ctrl_c_stops_at_the_next_step_and_says_how_to_resume(case: Case, number: int) -> None:
+    process = case.start(0.05, *case.options())
+    case.wait_for_stage("region")
+    process.send_signal(number)
+    _, stderr = process.communicate(timeout=10)
+    assert process.returncode == 130
+    assert "run the same command again to resume" in stderr
+    assert "Traceback" not in stderr
+    assert "Resuming: photos, cameras are done" in case.run().stderr
+
+
+@posix_only
+def test_the_second_ctrl_c_ends_at_once(case: Case) -> None:
+    command = case.command("hang", "cameras") + case.options()
+    pipe = subprocess.PIPE
+    with subprocess.Popen(command, env=case.environment, stdout=pipe, stderr=pipe, text=True) as process:
+        case.wait_for_stage("cameras")
+        time.sleep(0.5)
+        process.send_signal(signal.SIGINT)
+        time.sleep(0.5)
+        assert process.poll() is None
+        process.send_signal(signal.SIGINT)
+        assert process.wait(5) == 130
+    assert "Resuming: photos is done" in case.run().stderr
+
+
+# The wire.
+
+
+def test_a_job_file_gives_a_conversation(case: Case) -> None:
+    job = case.write_job()
+    with case.start(0.0, str(job)) as process:
+        assert process.stdout is not None
+        heard = messages(process.stdout.read())
+    assert process.returncode == 0
+    last = heard[-1]
+    assert isinstance(last, Finished)
+    assert Path(last.output) == case.output
+    assert set(last.files) >= RESULTS
+    names = [message.name for message in heard if isinstance(message, protocol.Stage)]
+    assert names[:6] == STAGES
+    assert any(isinstance(message, protocol.Warned) for message in heard)
+    previews = [message.path for message in heard if isinstance(message, protocol.Preview)]
+    assert previews
+    assert all(Path(path).is_file() for path in previews)
+
+
+@pytest.mark.parametrize(
+    "change", [{"protocol": 99}, {"preset": "best"}, {"surprise": 1}, {"images": "photos"}]
+)
+def test_a_wrong_job_is_refused(case: Case, change: dict[str, object]) -> None:
+    result = case.finish([*case.command(), str(case.write_job(**change))], input="")
+    last = messages(result.stdout)[-1]
+    assert result.returncode == 2
+    assert isinstance(last, Failed)
+    assert last.code == "settings_invalid"
+
+
+def test_trouble_on_the_wire_is_the_last_word(case: Case) -> None:
+    command = [*case.command("internal", "region"), str(case.write_job())]
+    with subprocess.Popen(
+        command, env=case.environment, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as process:
+        assert process.stdout is not None
+        last = messages(process.stdout.read())[-1]
+    assert process.returncode == 1
+    assert isinstance(last, Failed)
+    assert last.code == "internal"
+
+
+def test_a_cancel_line_stops_the_run_and_keeps_a_checkpoint(case: Case) -> None:
+    process = case.start(0.05, str(case.write_job()))
+    case.wait_for_stage("region")
+    stdout, _ = process.communicate('not json\n{"type": "other"}\n{"type": "cancel"}\n', timeout=10)
+    last = messages(stdout)[-1]
+    assert isinstance(last, Failed)
+    assert (last.code, process.returncode) == (protocol.CANCELLED, 130)
+    assert "Resuming: photos, cameras are done" in case.run().stderr
+
+
+def test_lines_that_are_no_cancel_do_not_stop_the_run(case: Case) -> None:
+    process = case.start(0.0, str(case.write_job()))
+    assert process.stdin is not None
+    assert process.stdout is not None
+    process.stdin.write('cancel\n{"type": "cancel", "now": true}\n')
+    process.stdin.flush()
+    assert isinstance(messages(process.stdout.read())[-1], Finished)
+    process.communicate()
+
+
+@pytest.mark.parametrize("trouble", ["none", "hang"])
+def test_the_callers_death_ends_the_run_within_two_seconds(case: Case, trouble: str) -> None:
+    command = [*case.command(trouble, "cameras", 0.05), str(case.write_job())]
+    process = subprocess.Popen(
+        command,
+        env=case.environment,
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+    )
+    case.wait_for_stage("cameras")
+    time.sleep(0.4)
+    assert process.stdin is not None
+    assert process.stdout is not None
+    process.stdout.close()
+    process.stdin.close()
+    assert process.wait(2.0) == 130
+    assert "Resuming: photos is done" in case.run().stderr
+
+
+@pytest.mark.slow
+def test_a_silent_stage_shows_signs_of_life(case: Case) -> None:
+    command = [*case.command("hang", "photos"), str(case.write_job())]
+    with subprocess.Popen(
+        command, env=case.environment, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as process:
+        assert process.stdout is not None
+        started_s = time.monotonic()
+        for line in process.stdout:
+            if isinstance(decode(line), protocol.Heartbeat):
+                break
+        process.kill()
+    assert time.monotonic() - started_s < 10.0

@@ -1,0 +1,134 @@
+"""Files of meshes and points: exact round trips, and what an independent reader sees."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+from backend.mesh_files import MeshFileError, read_mesh, write_glb, write_mesh, write_points
+from backend.scene import Region, SurfaceMesh, SurfacePoints
+
+
+def random_mesh(seed: int = 0, offset: float = 0.0) -> SurfaceMesh:
+    """An icosphere with random attributes at each vertex."""
+    random = np.random.default_rng(seed)
+    sphere = trimesh.creation.icosphere(subdivisions=1)
+    return SurfaceMesh(
+        vertices=np.asarray(sphere.vertices, np.float64) + offset,
+        faces=np.asarray(sphere.faces, np.int64),
+        normals=np.asarray(sphere.vertices, np.float32),
+        colours_srgb=random.integers(0, 256, (len(sphere.vertices), 3), np.uint8),
+        support=random.random(len(sphere.vertices), np.float32),
+    )
+
+
+def assert_same(found: SurfaceMesh, expected: SurfaceMesh) -> None:
+    for name in ("vertices", "faces", "normals", "colours_srgb", "support"):
+        ours, theirs = getattr(found, name), getattr(expected, name)
+        assert ours.dtype == theirs.dtype
+        np.testing.assert_array_equal(ours, theirs)
+
+
+@pytest.mark.parametrize("offset", [0.0, 5e6])
+def test_a_mesh_comes_back_to_the_bit(tmp_path: Path, offset: float) -> None:
+    mesh = random_mesh(offset=offset)
+    write_mesh(tmp_path / "mesh.ply", mesh)
+    assert_same(read_mesh(tmp_path / "mesh.ply"), mesh)
+
+
+def test_an_empty_mesh_comes_back(tmp_path: Path) -> None:
+    full = random_mesh()
+    names = ("vertices", "faces", "normals", "colours_srgb", "support")
+    empty = replace(full, **{name: getattr(full, name)[:0] for name in names})
+    write_mesh(tmp_path / "mesh.ply", empty)
+    assert_same(read_mesh(tmp_path / "mesh.ply"), empty)
+
+
+def test_another_reader_sees_the_same_mesh(tmp_path: Path) -> None:
+    mesh = random_mesh()
+    write_mesh(tmp_path / "mesh.ply", mesh)
+    found = trimesh.load_mesh(tmp_path / "mesh.ply", process=False)
+    np.testing.assert_array_equal(found.vertices, mesh.vertices)
+    np.testing.assert_array_equal(found.faces, mesh.faces)
+    np.testing.assert_array_equal(found.visual.vertex_colors[:, :3], mesh.colours_srgb)
+    np.testing.assert_array_equal(
+        found.metadata["_ply_raw"]["vertex"]["data"]["support"].ravel(), mesh.support
+    )
+    assert found.is_watertight
+    assert found.volume > 0
+
+
+def test_the_same_mesh_gives_the_same_bytes(tmp_path: Path) -> None:
+    for index in range(2):
+        write_mesh(tmp_path / f"{index}.ply", random_mesh())
+        write_glb(tmp_path / f"{index}.glb", random_mesh())
+    for kind in ("ply", "glb"):
+        assert (tmp_path / f"0.{kind}").read_bytes() == (tmp_path / f"1.{kind}").read_bytes()
+
+
+@pytest.mark.parametrize(
+    "damage", [lambda data: data[:-1], lambda data: data[100:], lambda data: data + b"x"]
+)
+def test_a_damaged_file_is_refused(tmp_path: Path, damage) -> None:  # type: ignore[no-untyped-def]
+    path = tmp_path / "mesh.ply"
+    write_mesh(path, random_mesh())
+    path.write_bytes(damage(path.read_bytes()))
+    with pytest.raises(MeshFileError):
+        read_mesh(path)
+
+
+def test_other_properties_of_the_same_size_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "mesh.ply"
+    write_mesh(path, random_mesh())
+    path.write_bytes(path.read_bytes().replace(b"float support", b"float quality"))
+    with pytest.raises(MeshFileError):
+        read_mesh(path)
+
+
+def test_glb_turns_z_up_into_y_up_and_keeps_handedness(tmp_path: Path) -> None:
+    mesh = random_mesh(offset=2.0)
+    write_glb(tmp_path / "mesh.glb", mesh)
+    found = trimesh.load_scene(tmp_path / "mesh.glb").to_mesh()
+    x, y, z = mesh.vertices.T
+    np.testing.assert_allclose(found.vertices, np.stack([x, z, -y], axis=-1), rtol=1e-6)
+    np.testing.assert_array_equal(found.faces, mesh.faces)
+    assert found.volume == pytest.approx(trimesh.Trimesh(mesh.vertices, mesh.faces).volume, rel=1e-5)
+
+
+def test_glb_colours_are_linear_light(tmp_path: Path) -> None:
+    mesh = random_mesh()
+    greys = np.array([[0, 0, 0], [5, 5, 5], [128, 128, 128], [255, 255, 255]], np.uint8)
+    mesh = replace(mesh, colours_srgb=np.resize(greys, mesh.colours_srgb.shape))
+    write_glb(tmp_path / "mesh.glb", mesh)
+    scene = trimesh.load_scene(tmp_path / "mesh.glb", process=False)
+    (found,) = scene.geometry.values()
+    colours = np.asarray(found.visual.vertex_attributes["color"], np.float64)[:4, 0]
+    np.testing.assert_allclose(colours / 65535, [0.0, 5 / 255 / 12.92, 0.2158605, 1.0], atol=1e-5)
+
+
+def test_points_leave_in_the_world_frame(tmp_path: Path) -> None:
+    object_from_world = np.diag([0.5, 0.5, 0.5, 1.0])
+    object_from_world[:3, :3] = object_from_world[:3, :3] @ np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    object_from_world[:3, 3] = [1, 2, 3]
+    world = np.array([[1.0, 2.0, 3.0], [-4.0, 5.0, 6.0]])
+    normals_world = np.array([[1.0, 0.0, 0.0], [0.0, 0.6, 0.8]])
+    positions = world @ object_from_world[:3, :3].T + object_from_world[:3, 3]
+    points = SurfacePoints(
+        positions=positions.astype(np.float32),
+        normals=(normals_world @ object_from_world[:3, :3].T * 2).astype(np.float32),
+        colours_srgb=np.array([[0.0, 0.5, 1.0], [1.0, 1.0, 0.0]], np.float32),
+        confidence=np.array([0.25, 1.0], np.float32),
+        num_views=np.array([2, 3]),
+        view_index=np.array([0, 1]),
+    )
+    write_points(tmp_path / "points.ply", points, Region(object_from_world=object_from_world))
+    cloud = trimesh.load(tmp_path / "points.ply")
+    raw = cloud.metadata["_ply_raw"]["vertex"]["data"]
+    np.testing.assert_allclose(cloud.vertices, world, atol=1e-6)
+    np.testing.assert_allclose(
+        np.stack([raw[n].ravel() for n in ("nx", "ny", "nz")], -1), normals_world, atol=1e-6
+    )
+    np.testing.assert_array_equal(cloud.colors[:, :3], [[0, 128, 255], [255, 255, 0]])
+    np.testing.assert_array_equal(raw["confidence"].ravel(), points.confidence)

@@ -1,0 +1,153 @@
+"""Loading photographs: order, names, sizes, masks and refusals."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import ExifTags, Image
+
+from backend.errors import Cancelled, ErrorCode, ReconstructionError
+from backend.scene import Photo, no_progress
+from backend.stages.photos import PhotosConfig, load_photos, match_masks, natural_order
+
+CONFIG = PhotosConfig(max_side_px=100)
+
+
+def write(path: Path, width: int = 40, height: int = 30, level: int = 128) -> Path:
+    path.parent.mkdir(exist_ok=True, parents=True)
+    Image.new("L", (width, height), level).convert("RGB").save(path)
+    return path
+
+
+def load(sources: list[Path], masks: Path | None = None, config: PhotosConfig = CONFIG) -> tuple[Photo, ...]:
+    return load_photos(sources, masks, config, progress=no_progress)
+
+
+def refusal(sources: list[Path], masks: Path | None = None) -> ReconstructionError:
+    with pytest.raises(ReconstructionError) as caught:
+        load(sources, masks)
+    assert caught.value.remedy
+    return caught.value
+
+
+def test_natural_order() -> None:
+    names = ["b1.jpg", "a10.jpg", "A2.jpg", "10.jpg", "9.jpg", "a.jpg"]
+    assert sorted(names, key=natural_order) == ["9.jpg", "10.jpg", "a.jpg", "A2.jpg", "a10.jpg", "b1.jpg"]
+
+
+def test_a_folder_gives_its_visible_pictures(tmp_path: Path) -> None:
+    for name in ["10.png", "9.JPG", "._9.jpg", ".hidden.png"]:
+        write(tmp_path / name)
+    (tmp_path / "notes.txt").write_text("no picture")
+    (tmp_path / "folder.png").mkdir()
+    assert [photo.name for photo in load([tmp_path])] == ["9.JPG", "10.png"]
+
+
+def test_a_file_counts_once_and_equal_names_are_told_apart(tmp_path: Path) -> None:
+    one, other = write(tmp_path / "a" / "x.png"), write(tmp_path / "b" / "x.png")
+    photos = load([one, other, one, tmp_path / "a" / ".." / "a" / "x.png"])
+    assert [photo.name for photo in photos] == ["a/x.png", "b/x.png"]
+
+
+def test_scaled_down_upright_with_the_original_size(tmp_path: Path) -> None:
+    exif = Image.Exif()
+    exif[ExifTags.Base.Orientation] = 6
+    exif.get_ifd(ExifTags.IFD.Exif)[ExifTags.Base.FocalLengthIn35mmFilm] = 43
+    Image.new("RGB", (400, 300)).save(tmp_path / "turned.jpg", exif=exif)
+    write(tmp_path / "wide.png", 50, 20)
+    turned, wide = load([tmp_path])
+    assert turned.image_srgb.shape == (100, 75, 3)
+    assert (turned.original_width, turned.original_height) == (300, 400)
+    assert turned.focal_px == pytest.approx(500, rel=0.01), "of the original"
+    assert wide.image_srgb.shape == (20, 50, 3), "never scaled up"
+
+
+def test_no_photographs(tmp_path: Path) -> None:
+    assert refusal([tmp_path]).code == ErrorCode.NO_PHOTOS
+    assert refusal([]).code == ErrorCode.NO_PHOTOS
+    missing = refusal([tmp_path / "nowhere"])
+    assert missing.code == ErrorCode.NO_PHOTOS
+    assert "nowhere" in missing.text
+
+
+def test_one_photograph_is_too_few(tmp_path: Path) -> None:
+    assert refusal([write(tmp_path / "a.png")]).code == ErrorCode.TOO_FEW_PHOTOS
+
+
+def test_an_unreadable_photograph_is_named(tmp_path: Path) -> None:
+    write(tmp_path / "a.png")
+    (tmp_path / "broken.jpg").write_bytes(b"\xff\xd8\xff no")
+    error = refusal([tmp_path])
+    assert error.code == ErrorCode.PHOTO_UNREADABLE
+    assert "broken.jpg" in error.text
+
+
+@pytest.mark.parametrize("mask_name", ["a.png", "A.TIF", "a_mask.png", "a.jpg.png", "a.jpg_mask.png"])
+def test_masks_are_found_by_name(mask_name: str, tmp_path: Path) -> None:
+    path = write(tmp_path / mask_name)
+    write(tmp_path / "ab.png")
+    assert match_masks(["a.jpg", "c.jpg"], tmp_path) == {"a.jpg": path}
+
+
+def test_a_mask_of_another_size_is_scaled(tmp_path: Path) -> None:
+    """As in DTU: masks smaller than the photographs. Half white at the mask's size is half white at ours."""
+    for name in ["a.png", "b.png"]:
+        write(tmp_path / "photos" / name, 160, 120)
+    half = np.zeros((48, 64), np.uint8)
+    half[:, 32:] = 255
+    (tmp_path / "masks").mkdir()
+    Image.fromarray(half).save(tmp_path / "masks" / "a.png")
+    with_mask, without = load([tmp_path / "photos"], tmp_path / "masks")
+    assert with_mask.mask is not None
+    assert with_mask.mask.shape == with_mask.image_srgb.shape[:2] == (75, 100)
+    assert (with_mask.mask[:, :48] == 0).all()
+    assert (with_mask.mask[:, 52:] == 1).all()
+    assert with_mask.mask.mean() == pytest.approx(0.5, abs=1e-3)
+    assert without.mask is None
+
+
+def test_masks_of_zeros_and_ones_count_as_black_and_white(tmp_path: Path) -> None:
+    for name in ["a.png", "b.png"]:
+        write(tmp_path / name)
+    (tmp_path / "m").mkdir()
+    Image.fromarray(np.eye(30, 40, dtype=np.uint8)).save(tmp_path / "m" / "a.png")
+    first = load([tmp_path], tmp_path / "m")[0]
+    assert first.mask is not None
+    np.testing.assert_array_equal(first.mask, np.eye(30, 40))
+
+
+def test_a_mask_counts_before_alpha(tmp_path: Path) -> None:
+    for name in ["a.png", "b.png"]:
+        Image.new("LA", (40, 30), (100, 51)).save(tmp_path / name)
+    write(tmp_path / "m" / "a.png", level=255)
+    masked, alpha = load([tmp_path], tmp_path / "m")
+    assert masked.mask is not None
+    assert alpha.mask is not None
+    assert masked.mask.min() == 1
+    np.testing.assert_allclose(alpha.mask, 0.2, atol=1e-6)
+
+
+def test_unusable_masks_are_refused(tmp_path: Path) -> None:
+    photos = [write(tmp_path / name) for name in ["a.png", "b.png"]]
+    write(tmp_path / "shape" / "a.png", 40, 40, level=255)
+    write(tmp_path / "names" / "c.png", level=255)
+    write(tmp_path / "empty" / "a.png", level=0)
+    (tmp_path / "broken").mkdir()
+    (tmp_path / "broken" / "b.png").write_bytes(b"no picture")
+    for folder, named in [("shape", "a.png"), ("names", "names"), ("empty", "a.png"), ("broken", "b.png")]:
+        error = refusal(photos, tmp_path / folder)
+        assert error.code == ErrorCode.MASK_UNUSABLE, folder
+        assert named in error.text
+    assert refusal(photos, tmp_path / "nowhere").code == ErrorCode.MASK_UNUSABLE
+
+
+def test_progress_can_cancel(tmp_path: Path) -> None:
+    write(tmp_path / "a.png")
+    write(tmp_path / "b.png")
+
+    def cancel(share: float, _text: str) -> None:
+        if share >= 0.5:
+            raise Cancelled
+
+    with pytest.raises(Cancelled):
+        load_photos([tmp_path], None, CONFIG, progress=cancel)
