@@ -4,6 +4,7 @@ Arrays are [row, column, channel]; values are encoded as sRGB (no colour profile
 """
 
 import math
+import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -141,7 +142,8 @@ def focal_px_or_none(exif: Image.Exif, width: int, height: int) -> float | None:
 def _decoded(path: Path) -> tuple[Shaped[np.ndarray, "height width *channels"], float | None]:
     """Pixels as stored, upright, and the focal length in pixels."""
     try:
-        with Image.open(path) as file:
+        # Pillow warns of large and of damaged files; what it cannot read it raises as well.
+        with warnings.catch_warnings(action="ignore"), Image.open(path) as file:
             exif = file.getexif()
             focal_px = focal_px_or_none(exif, *file.size)
             deep = _deep_colour_or_none(path) if file.format == "TIFF" else None

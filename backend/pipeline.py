@@ -7,24 +7,40 @@ device and the code. The same fingerprint means that the result can be taken fro
 
 import json
 import logging
+import platform
 import time
 import typing
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
+from importlib.metadata import version
 from itertools import takewhile
 from pathlib import Path
 
 import torch
 
-from .errors import ErrorCode, ReconstructionError
 from .machine import choose_device, peak_memory_bytes, set_up_torch
+from .maths.metrics import load_truth
 from .mesh_files import write_glb, write_mesh, write_points
-from .scene import Photo, Region, SolvedCameras, SurfaceMesh
+from .presets import Settings
+from .scene import Decision, Photo, Region, SolvedCameras, SurfaceMesh
+from .stages.cameras import solve_cameras
+from .stages.mesh import extract_mesh
+from .stages.nerfstudio import transforms_json
+from .stages.photos import load_photos
+from .stages.region import find_region
+from .stages.report import (
+    Report,
+    ReportInputs,
+    StageTiming,
+    build_report,
+    render_report_html,
+    report_numbers,
+)
+from .stages.stereo import StereoResult, match_views
+from .stages.train import Surface, fit_surface
+from .version import VERSION
 from .workspace import LOG, StageCost, Workspace, check_free_space, fingerprint
-
-if typing.TYPE_CHECKING:
-    from .presets import Settings
 
 T = typing.TypeVar("T")
 CHECKPOINTED = ("photos", "cameras", "region", "stereo", "train", "mesh")
@@ -60,14 +76,26 @@ class Stages:
     The annotated return type of each says how its result is kept.
     """
 
-    load_photos: Callable[..., tuple[Photo, ...]]
-    solve_cameras: Callable[..., SolvedCameras]
-    find_region: Callable[..., Region]
-    match_views: Callable[..., typing.Any]
-    fit_surface: Callable[..., typing.Any]
-    extract_mesh: Callable[..., SurfaceMesh]
-    build_report: Callable[..., typing.Any]
-    transforms_json: Callable[[SolvedCameras], dict[str, object]]
+    load_photos: Callable[..., tuple[Photo, ...]] = load_photos
+    solve_cameras: Callable[..., SolvedCameras] = solve_cameras
+    find_region: Callable[..., Region] = find_region
+    match_views: Callable[..., StereoResult] = match_views
+    fit_surface: Callable[..., Surface] = fit_surface
+    extract_mesh: Callable[..., SurfaceMesh] = extract_mesh
+    build_report: Callable[..., Report] = build_report
+
+
+STAGES = Stages()
+
+
+@dataclass(frozen=True, kw_only=True)
+class Outcome:
+    """What a run gave."""
+
+    files: tuple[str, ...]
+    """Names in the output folder."""
+    summary: tuple[str, ...]
+    """A few lines for a person."""
 
 
 class Listener(typing.Protocol):
@@ -100,11 +128,18 @@ class _Run:
     listener: Listener
     fingerprints: dict[str, str]
     costs: dict[str, StageCost] = field(default_factory=dict)
+    warnings: list[str] = field(default_factory=list)
+
+    def warn(self, text: str) -> None:
+        """Tell the user now, and again in the report."""
+        self.warnings.append(text)
+        logger.warning("%s", text)
+        self.listener.warned(text)
 
     def stage(self, name: str, work: "partial[T]") -> T:
         """The result of the stage, from the last run where nothing it depends on has changed."""
         hint: type[T] = typing.get_type_hints(work.func)["return"]
-        self.listener.stage_started(name, STAGE_NAMES.index(name) + 1, len(STAGE_NAMES))
+        self._start(name)
         kept = self.workspace.load_or_none(name, self.fingerprints[name], hint)
         if kept is None:
             result, cost = self._measured(work)
@@ -117,6 +152,23 @@ class _Run:
         self.listener.stage_finished(cost)
         return result
 
+    def unkept_stage(self, name: str, work: "partial[T]") -> T:
+        """The result of a stage that is quicker to do again than to keep."""
+        self._start(name)
+        result, cost = self._measured(work)
+        self.listener.stage_finished(cost)
+        return result
+
+    def timings(self) -> tuple[StageTiming, ...]:
+        """What each stage took when it was computed, be it by an earlier run."""
+        return tuple(
+            StageTiming(name=name, seconds=cost.seconds, peak_memory_bytes=cost.peak_memory_bytes)
+            for name, cost in self.costs.items()
+        )
+
+    def _start(self, name: str) -> None:
+        self.listener.stage_started(name, STAGE_NAMES.index(name) + 1, len(STAGE_NAMES))
+
     def _measured(self, work: "partial[T]") -> tuple[T, StageCost]:
         self.listener.progressed(0.0, "")
         started = time.perf_counter()
@@ -125,20 +177,14 @@ class _Run:
         return result, cost
 
 
-def run(
-    job: Job, workspace: Workspace, *, settings: "Settings", stages: Stages, listener: Listener
-) -> tuple[str, ...]:
-    """Reconstruct, going on where an earlier run of the same job stopped; names of the files written.
+def run(job: Job, workspace: Workspace, *, settings: Settings, stages: Stages, listener: Listener) -> Outcome:
+    """Reconstruct, going on where an earlier run of the same job stopped.
 
     Raises ReconstructionError for what the user can mend and Cancelled where the listener does; then the
     results of an earlier run are as they were.
     """
-    if job.truth is not None and not job.truth.is_file():
-        raise ReconstructionError(
-            ErrorCode.TRUTH_UNREADABLE,
-            f"There is no file {job.truth}.",
-            "Give the path of a mesh to --truth.",
-        )
+    if job.truth is not None:
+        load_truth(job.truth)  # better told now than after minutes of work
     device = choose_device(job.device)
     set_up_torch(device)
     fingerprints = stage_fingerprints(job, settings, device.type)
@@ -149,37 +195,40 @@ def run(
     this = _Run(workspace=workspace, listener=listener, fingerprints=fingerprints)
 
     photos = this.stage("photos", partial(stages.load_photos, job.images, job.masks, settings.photos))
-    workdir = workspace.emptied_sfm_folder()
-    solve = partial(
-        stages.solve_cameras, photos, job.cameras, settings.cameras, workdir=workdir, seed=job.seed
-    )
+    scratch = {"workdir": workspace.emptied_sfm_folder(), "seed": job.seed}
+    solve = partial(stages.solve_cameras, photos, job.cameras, settings.cameras, **scratch)
     solved = this.stage("cameras", solve)
-    _warn_of_unplaced(solved, len(photos), listener)
-    del photos  # the views hold what is needed of them
+    _warn_of_unplaced(solved, len(photos), this)
+    del photos, solve  # the views hold what is needed of them
     region = this.stage("region", partial(stages.find_region, solved, settings.region))
     views = solved.views
     stereo = this.stage("stereo", partial(stages.match_views, views, region, settings.stereo, device=device))
     write_points(workspace.preview_path, stereo.points, region)
     listener.previewed(workspace.preview_path)
-    generator = torch.Generator(device).manual_seed(job.seed)
-    fit = partial(
-        stages.fit_surface, views, region, stereo, settings.train, device=device, generator=generator
-    )
+    chance = {"device": device, "generator": torch.Generator(device).manual_seed(job.seed)}
+    fit = partial(stages.fit_surface, views, region, stereo, settings.train, **chance)
     surface = this.stage("train", fit)
-    extract = partial(stages.extract_mesh, views, region, stereo, surface, settings.mesh, device=device)
+    extract = partial(stages.extract_mesh, views, region, stereo, surface, settings.mesh)
     mesh = this.stage("mesh", extract)
+    inputs = ReportInputs(
+        job_name=job.output.resolve().name,
+        settings=settings,
+        seed=job.seed,
+        timings=this.timings(),
+        warnings=tuple(this.warnings),
+        decisions=_decisions(solved, region, stereo, stereo.points, surface, mesh),
+        solved=solved,
+        region=region,
+        points=stereo.points,
+        mesh=mesh,
+        truth=job.truth,
+        versions=_versions(),
+    )
+    report = this.unkept_stage("report", partial(stages.build_report, inputs, settings.report))
+    return Outcome(files=_write(report, workspace), summary=_summary(report))
 
-    writers: dict[str, Callable[[Path], object]] = {
-        "mesh.ply": partial(write_mesh, mesh=mesh),
-        "mesh.glb": partial(write_glb, mesh=mesh),
-        "points.ply": partial(write_points, points=stereo.points, region=region),
-        "cameras.json": partial(_write_json, content=stages.transforms_json(solved)),
-    }
-    workspace.write_results(writers)
-    return (*writers, LOG)
 
-
-def stage_fingerprints(job: Job, settings: "Settings", device_kind: str) -> dict[str, str]:
+def stage_fingerprints(job: Job, settings: Settings, device_kind: str) -> dict[str, str]:
     """For each stage, a name of all it depends on; a stage after a changed one changes too."""
     own: dict[str, tuple[object, ...]] = {
         "photos": (code_fingerprint(), *job.images, "masks", job.masks, settings.photos),
@@ -222,27 +271,62 @@ def _needed_bytes(job: Job) -> int:
     return _BYTES_FOR_RESULTS + num_photos * _BYTES_PER_PHOTO
 
 
-def _warn_of_unplaced(solved: SolvedCameras, num_photos: int, listener: Listener) -> None:
+def _warn_of_unplaced(solved: SolvedCameras, num_photos: int, this: _Run) -> None:
     if solved.unplaced:
         names = ", ".join(solved.unplaced)
-        listener.warned(f"{len(solved.unplaced)} of {num_photos} photographs could not be placed: {names}.")
+        this.warn(f"{len(solved.unplaced)} of {num_photos} photographs could not be placed: {names}.")
 
 
-def _write_json(path: Path, content: dict[str, object]) -> None:
-    path.write_text(json.dumps(content, indent=2, allow_nan=False) + "\n", encoding="utf-8")
+def _decisions(*results: typing.Any) -> tuple[Decision, ...]:
+    """The decisions of all stages, in their order, each once."""
+    found = (decision for result in results for decision in getattr(result, "decisions", ()))
+    return tuple(dict.fromkeys(found))
 
 
-def _pending(*_arguments: object, **_options: object) -> typing.Any:
-    raise NotImplementedError
+def _versions() -> dict[str, str]:
+    """What the result depends on, with versions."""
+    packages = ("torch", "pycolmap", "scikit-image", "numpy")
+    return {"FewView": VERSION, "Python": platform.python_version(), **{n: version(n) for n in packages}}
 
 
-STAGES = Stages(
-    load_photos=_pending,
-    solve_cameras=_pending,
-    find_region=_pending,
-    match_views=_pending,
-    fit_surface=_pending,
-    extract_mesh=_pending,
-    build_report=_pending,
-    transforms_json=lambda _solved: {},
-)
+def _write(report: Report, workspace: Workspace) -> tuple[str, ...]:
+    """Put all results in place; their names."""
+    inputs = report.inputs
+    numbers = _json(report_numbers(report))
+    page = render_report_html(report)
+    cameras = _json(transforms_json(inputs.solved))
+    writers: dict[str, Callable[[Path], object]] = {
+        "mesh.ply": partial(write_mesh, mesh=inputs.mesh),
+        "mesh.glb": partial(write_glb, mesh=inputs.mesh),
+        "points.ply": partial(write_points, points=inputs.points, region=inputs.region),
+        "cameras.json": lambda path: path.write_text(cameras, encoding="utf-8"),
+        "report.json": lambda path: path.write_text(numbers, encoding="utf-8"),
+        "report.html": lambda path: path.write_text(page, encoding="utf-8"),
+    }
+    workspace.write_results(writers)
+    return (*writers, LOG)
+
+
+def _json(content: dict[str, object]) -> str:
+    return json.dumps(content, indent=2, allow_nan=False) + "\n"
+
+
+def _summary(report: Report) -> tuple[str, ...]:
+    """The result in a few lines."""
+    mesh = report.mesh
+    closed = "closed" if mesh.watertight else "open"
+    lines = [
+        f"{mesh.num_faces} triangles, {closed}; {mesh.measured_share:.0%} of the surface measured, "
+        f"{mesh.guessed_share:.0%} guessed; {report.total_seconds:.0f} s of computing"
+    ]
+    if report.mean_psnr_db is not None:
+        lines.append(f"PSNR against the photographs: {report.mean_psnr_db:.1f} dB")
+    if report.error is not None:
+        parts = {"the whole truth": report.error.whole, "its visible part": report.error.visible}
+        lines += [
+            f"Error against {name}: Chamfer {part.chamfer_percent:.3f} % of the diagonal, "
+            f"F-score at 1 %: {part.f_score_at_one_percent:.3f}"
+            for name, part in parts.items()
+            if part is not None
+        ]
+    return tuple(lines)

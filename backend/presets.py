@@ -1,24 +1,43 @@
 """Named settings as data: how much time a run takes, and for what detail."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from types import MappingProxyType
 
 from .stages.cameras import CamerasConfig
+from .stages.mesh import MeshConfig
 from .stages.photos import PhotosConfig
 from .stages.region import RegionConfig
+from .stages.report import ReportConfig
 from .stages.stereo import StereoConfig
+from .stages.train import TrainConfig
 
 
 @dataclass(frozen=True, kw_only=True)
 class Settings:
     """One config per stage."""
 
-    photos: PhotosConfig = PhotosConfig()
-    cameras: CamerasConfig = CamerasConfig()
-    region: RegionConfig = RegionConfig()
-    stereo: StereoConfig = StereoConfig()
-    train: object = None
-    mesh: object = None
+    photos: PhotosConfig = field(default_factory=PhotosConfig)
+    cameras: CamerasConfig = field(default_factory=CamerasConfig)
+    region: RegionConfig = field(default_factory=RegionConfig)
+    stereo: StereoConfig = field(default_factory=StereoConfig)
+    train: TrainConfig = field(default_factory=TrainConfig)
+    mesh: MeshConfig = field(default_factory=MeshConfig)
+    report: ReportConfig = field(default_factory=ReportConfig)
 
 
-PRESETS = MappingProxyType({"fast": Settings(), "balanced": Settings(), "detailed": Settings()})
+PRESETS = MappingProxyType(
+    {
+        "fast": Settings(
+            photos=PhotosConfig(max_side_px=800),
+            train=TrainConfig(levels=(32, 64, 96), steps=(0, 0, 100)),
+            mesh=MeshConfig(max_faces=100_000),
+        ),
+        "balanced": Settings(),
+        "detailed": Settings(
+            photos=PhotosConfig(max_side_px=2400),
+            train=TrainConfig(levels=(32, 64, 128, 192), steps=(0, 0, 200, 300)),
+            mesh=MeshConfig(max_faces=500_000),
+        ),
+    }
+)
+"""By name; the names are those of backend.wire.protocol.PRESETS."""

@@ -5,6 +5,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from rich.console import Console
 from rich.markup import escape
@@ -22,6 +23,9 @@ from rich.progress import (
 from .commands.cancelling import CancelRequest
 from .errors import ReconstructionError
 from .workspace import StageCost
+
+if TYPE_CHECKING:
+    from .pipeline import Outcome
 
 _PLAIN_INTERVAL_S = 10.0
 
@@ -76,10 +80,11 @@ class TerminalListener:
         """Acknowledge the first Ctrl-C."""
         self._say("Stopping at the next step (press Ctrl-C again to end at once) ...")
 
-    def finished(self, output: Path, files: tuple[str, ...]) -> None:
-        """Say where the results are."""
+    def finished(self, output: Path, outcome: "Outcome") -> None:
+        """Say where the results are and what they are worth."""
         self._stop_bars()
-        sys.stdout.write("".join(f"{output / name}\n" for name in files))
+        lines = [*outcome.summary, *(str(output / name) for name in outcome.files)]
+        sys.stdout.write("".join(f"{line}\n" for line in lines))
         sys.stdout.flush()
 
     def failed(self, error: ReconstructionError) -> None:

@@ -12,6 +12,9 @@ from numpy.typing import NDArray
 
 from .view_layout import Lens
 
+FLAT = 1e-6
+"""Volume over the cube of the size, below which a sheet has no inside that could tell its front."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class TrueMesh:
@@ -44,23 +47,39 @@ def _evaluated(made: Any) -> TrueMesh:
     mesh = made.to_mesh()
     mesh.calc_loop_triangles()
     vertices = np.empty(len(mesh.vertices) * 3, np.float32)
-    normals = np.empty(len(mesh.vertices) * 3, np.float32)
     faces = np.empty(len(mesh.loop_triangles) * 3, np.int32)
     mesh.vertices.foreach_get("co", vertices)
-    mesh.vertex_normals.foreach_get("vector", normals)
     mesh.loop_triangles.foreach_get("vertices", faces)
     made.to_mesh_clear()
     world_from_object = np.array(made.matrix_world, np.float64)
     vertices_world = vertices.reshape(-1, 3) @ world_from_object[:3, :3].T + world_from_object[:3, 3]
-    # Normals are covectors: they go with the inverse transpose.
-    normals_world = normals.reshape(-1, 3) @ np.linalg.inv(world_from_object[:3, :3])
-    normals_world /= np.maximum(np.linalg.norm(normals_world, axis=1, keepdims=True), np.finfo(float).tiny)
     triangles = faces.reshape(-1, 3)
     if np.linalg.det(world_from_object[:3, :3]) < 0:  # a mirror turns the triangles round
         triangles = triangles[:, ::-1]
-    if signed_volume(vertices_world, triangles) < 0:
-        triangles, normals_world = triangles[:, ::-1], -normals_world
-    return TrueMesh(vertices=vertices_world, normals=normals_world, faces=triangles)
+    extent = np.linalg.norm(np.ptp(vertices_world, axis=0))
+    if signed_volume(vertices_world, triangles) < -FLAT * extent**3:
+        triangles = triangles[:, ::-1]
+    normals = vertex_normals(vertices_world, triangles)
+    return TrueMesh(vertices=vertices_world, normals=normals, faces=triangles)
+
+
+def vertex_normals(vertices: NDArray[np.float64], faces: NDArray[np.int32]) -> NDArray[np.float64]:
+    """(vertices, 3): mean of the triangles' normals by area; 0 where a vertex has no triangle.
+
+    Computed here because Blender's own are those that a file brought, where it brought any.
+    """
+    corners = vertices[faces]
+    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    sums = np.stack(
+        [
+            np.bincount(faces.ravel(), weights=np.repeat(across[:, axis], 3), minlength=len(vertices))
+            for axis in range(3)
+        ],
+        axis=-1,
+    )
+    lengths = np.linalg.norm(sums, axis=1, keepdims=True)
+    normals: NDArray[np.float64] = np.divide(sums, lengths, out=np.zeros_like(sums), where=lengths > 0)
+    return normals
 
 
 def signed_volume(vertices: NDArray[np.float64], faces: NDArray[np.int32]) -> float:

@@ -11,15 +11,15 @@ from typing import TYPE_CHECKING
 
 from ..errors import Cancelled, ErrorCode, ReconstructionError
 from ..failures import explain_or_none, internal_error
+from ..version import VERSION
 from ..wire import protocol
 from ..wire.speaker import Speaker, speaker
 from .cancelling import EXIT_CANCELLED, CancelRequest, catch_signals, watch_signals, watch_stdin
 
 if TYPE_CHECKING:
-    from ..pipeline import Job, Listener
+    from ..pipeline import Job, Listener, Outcome
 
 EXIT_FINE, EXIT_INTERNAL, EXIT_USER_ERROR = 0, 1, 2
-VERSION = "0.1.0"
 
 logger = logging.getLogger(__name__)
 
@@ -77,8 +77,8 @@ def settle(
     return EXIT_FINE
 
 
-def run_job(job: protocol.Job, base: Path, listener: "Listener") -> tuple[str, ...]:
-    """Reconstruct into the job's output folder; names of the files written."""
+def run_job(job: protocol.Job, base: Path, listener: "Listener") -> "Outcome":
+    """Reconstruct into the job's output folder."""
     from .. import pipeline  # torch may be missing, and doctor must still start
     from ..presets import PRESETS
     from ..workspace import open_workspace
@@ -150,9 +150,9 @@ def _run_job_file(job_path: Path, request: CancelRequest, speaking: Speaker) -> 
     from .wire_listener import WireListener
 
     job = _read_job(job_path)
-    files = run_job(job, job_path.absolute().parent, WireListener(request, speaking))
+    outcome = run_job(job, job_path.absolute().parent, WireListener(request, speaking))
     output = job_path.absolute().parent / job.output
-    say_last(speaking, protocol.Finished(output=str(output), files=files))
+    say_last(speaking, protocol.Finished(output=str(output), files=outcome.files))
 
 
 def _read_job(path: Path) -> protocol.Job:

@@ -57,19 +57,26 @@ def _offsets(first: int, last: int, device: torch.device) -> Int[Tensor, "offset
     return torch.cartesian_prod(steps, steps, steps)
 
 
-def off_silhouette(
-    camera: Pinhole, distance_px: Float[Tensor, "height width"], nodes: int
-) -> Float[Tensor, "nodes nodes nodes"]:
-    """Distance of every node from the silhouette, in object units: > 0 off the subject, < 0 on it.
-
-    `distance_px` is the image's signed distance to the mask's outline; a node that the photograph does
-    not show gets minus infinity (it may be anything).
-    """
-    points = node_positions(nodes, distance_px.device)
+def read_at_nodes(
+    camera: Pinhole, image: Float[Tensor, "height width"], nodes: int, mode: str = "bilinear"
+) -> tuple[Float[Tensor, "nodes nodes nodes"], Float[Tensor, "nodes nodes nodes"], Bool[Tensor, "nodes nodes nodes"]]:
+    """What an image holds where it shows each node, each node's depth, and whether it is shown at all."""
+    points = node_positions(nodes, image.device)
     pixel, depth = project(camera, points)
     shown = inside(pixel, camera.width, camera.height) & (depth > 0)
     flat = pixel.reshape(nodes, nodes * nodes, 2)
-    at = sample_image(distance_px[None], flat[None])[0, 0].reshape(shown.shape)
+    return sample_image(image[None], flat[None], mode=mode)[0, 0].reshape(shown.shape), depth, shown
+
+
+def off_silhouette(
+    camera: Pinhole, outline_px: Float[Tensor, "height width"], nodes: int
+) -> Float[Tensor, "nodes nodes nodes"]:
+    """Distance of every node from the silhouette, in object units: > 0 off the subject, < 0 on it.
+
+    `outline_px` is the image's signed distance to the mask's outline; a node that the photograph does
+    not show gets minus infinity (it may be anything).
+    """
+    at, depth, shown = read_at_nodes(camera, outline_px, nodes)
     return torch.where(shown, at * depth / camera.intrinsics[0, 0], -torch.inf)
 
 
@@ -77,9 +84,17 @@ def seen_through(
     camera: Pinhole, depth_map: Float[Tensor, "height width"], margin: float, nodes: int
 ) -> Bool[Tensor, "nodes nodes nodes"]:
     """Nodes that lie in front of what the photograph measured, by more than `margin`."""
-    points = node_positions(nodes, depth_map.device)
-    pixel, depth = project(camera, points)
-    shown = inside(pixel, camera.width, camera.height) & (depth > 0)
-    flat = pixel.reshape(nodes, nodes * nodes, 2)
-    measured = sample_image(depth_map[None], flat[None], mode="nearest")[0, 0].reshape(shown.shape)
+    measured, depth, shown = read_at_nodes(camera, depth_map, nodes, mode="nearest")
     return shown & (measured > 0) & (depth < measured - margin)
+
+
+def behind_front(
+    camera: Pinhole, guess: Float[Tensor, "height width"], thickness: Float[Tensor, "height width"], nodes: int
+) -> Float[Tensor, "nodes nodes nodes"]:
+    """How far each node lies behind the back of a body of given thickness under the photograph's surface.
+
+    Negative within the body or in front of it; infinite where the photograph shows no surface.
+    """
+    front, depth, shown = read_at_nodes(camera, guess, nodes, mode="nearest")
+    thick, _, _ = read_at_nodes(camera, thickness, nodes)
+    return torch.where(shown & (front > 0), depth - front - thick, torch.inf)

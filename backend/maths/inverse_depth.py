@@ -5,6 +5,7 @@ x = (u - cx) / fx, y = (v - cy) / fy; so slopes of w give the normal in closed f
 """
 
 import torch
+import torch.nn.functional as F
 from jaxtyping import Float, Int
 from torch import Tensor
 
@@ -55,6 +56,27 @@ def normals_from_planes(
     normal = -torch.stack([n_x, n_y, n_z], dim=-1)
     normal = normal / normal.norm(dim=-1, keepdim=True).clamp(min=1e-12)
     return normal @ camera.camera_from_object[:3, :3]
+
+
+def filled_holes(
+    values: Float[Tensor, "height width"], weight: Float[Tensor, "height width"]
+) -> Float[Tensor, "height width"]:
+    """The map where it has weight; elsewhere the nearest weighted mean that is coarse enough to know.
+
+    Pull and push (Gortler et al., "The Lumigraph", 1996, section 3.4): means over ever larger squares,
+    then back down, each level filling what the finer one lacks.
+    """
+    height, width = values.shape
+    if min(height, width) < 2:
+        mean = (values * weight).sum() / weight.sum().clamp(min=1e-12)
+        return torch.full_like(values, float(mean))
+    stacked = torch.stack([values * weight, weight])[None]
+    pulled = F.avg_pool2d(stacked, 2, ceil_mode=True, count_include_pad=False)[0] * 4
+    coarse_weight = pulled[1]
+    coarse = filled_holes(pulled[0] / coarse_weight.clamp(min=1e-12), coarse_weight.clamp(max=1.0))
+    pushed = F.interpolate(coarse[None, None], size=(height, width), mode="bilinear")[0, 0]
+    trust = weight.clamp(max=1.0)
+    return trust * values + (1 - trust) * pushed
 
 
 def parabola_offset(

@@ -123,7 +123,7 @@ def surface_error(
 
 
 def vertex_error_percent(
-    mesh: SurfaceMesh, truth: TrueSurface, *, seed: int, num_samples: int = 400_000
+    mesh: SurfaceMesh, truth: TrueSurface, *, seed: int, num_samples: int = 200_000
 ) -> Float32[np.ndarray, "vertices"]:
     """Distance of each of the mesh's vertices from the truth, in percent of its diagonal."""
     samples = _sample_truth(truth, num_samples, np.random.default_rng(seed))

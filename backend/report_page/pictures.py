@@ -22,6 +22,8 @@ JPEG_QUALITY = 86
 CLAY_LINEAR = np.array([0.60, 0.56, 0.52])
 INSIDE_LINEAR = np.array([0.16, 0.20, 0.30])
 """Faces seen from behind are bluish: the surface is open there."""
+BEHIND_COSINE = 0.3
+"""Interpolated normals turn away by less at the outline of a coarse mesh, where no face shows its back."""
 KEY_LIGHT = np.array([-0.45, -0.65, -0.61])
 FILL_LIGHT = np.array([0.75, -0.05, -0.66])
 
@@ -32,6 +34,9 @@ ERROR_STOPS_SRGB = np.array([[245, 241, 232], [252, 196, 110], [226, 88, 52], [1
 
 TURNTABLE_FIELD_OF_VIEW_DEG = 30.0
 TURNTABLE_ELEVATION_DEG = 18.0
+
+LEVELNESS_WEIGHT = 0.01
+"""Of the pictures' own up beside the x axes, which spread by 0.01 within an arc of about 20 degrees."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -115,15 +120,14 @@ def turntable_cameras(
 ) -> tuple[Camera, ...]:
     """Cameras evenly around the mesh, from between the given cameras' sides, all of it in the picture.
 
-    Up is where the tops of the photographs point to on average; the first camera is a half step aside
-    from the mean of the given ones, so that the views are new ones.
+    The first camera is half a step aside from the mean of the given ones, so that the views are new ones.
     """
     low, high = np.quantile(vertices, [0.01, 0.99], axis=0)
     centre = (low + high) / 2
     radius = float(np.quantile(np.linalg.norm(vertices - centre, axis=1), 0.99)) or 1.0
-    up = _direction(-np.mean([camera.camera_from_world[1, :3] for camera in cameras], axis=0))
+    up = up_direction(cameras)
     towards = np.mean([_direction(camera.position - centre) for camera in cameras], axis=0)
-    front = _direction(towards - towards @ up * up)
+    front = _level_direction(towards, up)
     side = np.cross(up, front)
     distance = radius / np.sin(np.radians(TURNTABLE_FIELD_OF_VIEW_DEG / 2)) * 1.03
     elevation = np.radians(TURNTABLE_ELEVATION_DEG)
@@ -134,6 +138,19 @@ def turntable_cameras(
         backwards = np.cos(elevation) * level + np.sin(elevation) * up
         found.append(_looking_at(centre, centre + distance * backwards, up, size_px))
     return tuple(found)
+
+
+def up_direction(cameras: Sequence[Camera]) -> Float64[np.ndarray, "3"]:
+    """Unit vector of the world that is up, for photographs held upright with a level horizon.
+
+    A level camera's x axis is horizontal however much the camera is tilted: up is the direction most
+    across all x axes. Where they are parallel, the mean of the pictures' own up decides.
+    """
+    x_axes, tops = (np.stack([camera.camera_from_world[row, :3] for camera in cameras]) for row in (0, 1))
+    top = _direction(-tops.mean(axis=0))
+    along = x_axes.T @ x_axes / len(x_axes) - LEVELNESS_WEIGHT * np.outer(top, top)
+    up = np.asarray(np.linalg.eigh(along)[1][:, 0])
+    return up if up @ top >= 0 else -up
 
 
 def _looking_at(
@@ -160,10 +177,19 @@ def _looking_at(
     )
 
 
+def _level_direction(
+    vector: Float64[np.ndarray, "3"], up: Float64[np.ndarray, "3"]
+) -> Float64[np.ndarray, "3"]:
+    """Unit vector of what of the vector is across up; any across up where that is nothing."""
+    across = vector - vector @ up * up
+    if np.linalg.norm(across) < 1e-6:  # cameras all around, or straight above
+        axis = np.eye(3)[np.argmin(np.abs(up))]
+        across = axis - axis @ up * up
+    return _direction(across)
+
+
 def _direction(vector: Float64[np.ndarray, "3"]) -> Float64[np.ndarray, "3"]:
-    """The vector at unit length; any direction where it is zero, as when cameras face each other."""
-    length = np.linalg.norm(vector)
-    return vector / length if length > 1e-9 else np.array([0.0, 0.0, 1.0])
+    return np.asarray(vector / np.linalg.norm(vector))
 
 
 def _towards_camera(
@@ -173,5 +199,6 @@ def _towards_camera(
     normals = image.normal_world @ camera.camera_from_world[:3, :3].T.astype(np.float32)
     rows, columns = np.mgrid[: camera.height, : camera.width] + 0.5
     x, y = (columns - camera.cx_px) / camera.fx_px, (rows - camera.cy_px) / camera.fy_px
-    from_behind = normals[..., 0] * x + normals[..., 1] * y + normals[..., 2] > 0
+    away = (normals[..., 0] * x + normals[..., 1] * y + normals[..., 2]) / np.sqrt(x**2 + y**2 + 1)
+    from_behind = away > BEHIND_COSINE
     return np.where(from_behind[..., None], -normals, normals), from_behind

@@ -1,11 +1,29 @@
 """Numbers as the report's readers say them."""
 
 import math
+from types import MappingProxyType
 
 import numpy as np
 from jaxtyping import Float
 
 UNKNOWN = "–"
+
+STAGE_TEXTS = MappingProxyType(
+    {
+        "photos": "Reading the photographs",
+        "cameras": "Finding where each was taken",
+        "region": "Finding the subject",
+        "stereo": "Measuring points",
+        "train": "Fitting the surface",
+        "mesh": "Making the mesh",
+        "report": "This report",
+    }
+)
+
+
+def stage_text(name: str) -> str:
+    """What a stage does; its own name where it is not known here."""
+    return STAGE_TEXTS.get(name, name)
 
 
 def duration_text(seconds: float) -> str:

@@ -26,8 +26,8 @@ _ZOOM_STEPS = 64
 _ZOOM_BISECTIONS = 12
 _ROUND_TRIP_PX = 0.01
 """Where a distortion folds back on itself, going there and back ends elsewhere."""
-_OUTSIDE_PX = 0.5
-"""A border this far outside still has its nearest pixel under it."""
+_OUTSIDE_PX = 0.01
+"""Of rounding; beyond it the border would repeat its last pixels."""
 
 
 @dataclass(frozen=True, kw_only=True)

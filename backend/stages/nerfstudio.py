@@ -66,8 +66,8 @@ def frame_lens(frame: Frame, photo: Photo) -> pycolmap.Camera:
 
     Raises ReconstructionError(CAMERAS_UNUSABLE).
     """
-    width = _number(frame, "w", photo, photo.original_width)
-    height = _number(frame, "h", photo, photo.original_height)
+    width = _number(frame, "w", photo, float(photo.original_width))
+    height = _number(frame, "h", photo, float(photo.original_height))
     fx, fy = _focal_lengths(frame, photo, width, height)
     cx, cy = _number(frame, "cx", photo, width / 2), _number(frame, "cy", photo, height / 2)
     k1, k2, k3, k4, p1, p2 = (_number(frame, key, photo, 0.0) for key in ("k1", "k2", "k3", "k4", "p1", "p2"))

@@ -128,7 +128,7 @@ def _of_masks(views: list[View], config: RegionConfig) -> tuple[Float64[np.ndarr
     """Bounding sphere of the visual hull: what lies inside the masks of all photographs that show it.
 
     Photographs from nearly one side leave the hull open in depth; there the subject is taken to be
-    no deeper than it is wide.
+    at most half again as deep as it is wide.
     """
     first_centre, first_radius = _first_guess(views)
     centre, radius = first_centre, first_radius
@@ -175,7 +175,7 @@ def _first_guess(views: list[View]) -> tuple[Float64[np.ndarray, "3"], float]:
         rays.append((view.camera, size_px))
     centre = np.linalg.lstsq(system, right, rcond=1e-9)[0]
     radius = max(np.linalg.norm(centre - c.position) * size / c.fx_px for c, size in rays)
-    return centre, float(radius) * 1.1
+    return centre, float(radius) * 1.5
 
 
 def _in_all_masks(points: Float64[np.ndarray, "points 3"], views: list[View]) -> Bool[np.ndarray, "points"]:

@@ -36,7 +36,7 @@ from ..maths.geometry import (
     unproject,
     warp_pixels,
 )
-from ..maths.inverse_depth import fit_planes, lowest_with_neighbours, normals_from_planes
+from ..maths.inverse_depth import filled_holes, fit_planes, lowest_with_neighbours, normals_from_planes
 from ..maths.semi_global import aggregate
 from ..scene import Decision, Progress, Region, SurfacePoints, View
 
@@ -49,7 +49,7 @@ class StereoConfig:
     """Photographs that each one is compared with, at most."""
     coarse_pixels: int = 50_000
     """Pixels of the window in which all depths are tried."""
-    num_planes: int = 128
+    num_planes: int = 192
     """Depths tried there, at most."""
     patch_radius: int = 3
     """Half width of the patches, in pixels of the size at hand."""
@@ -67,7 +67,8 @@ class DepthMap:
 
     depth: Float32[np.ndarray, "height width"]
     """Along the camera's axis, object units; 0 where nothing was measured."""
-    confidence: Float32[np.ndarray, "height width"]
+    guess: Float32[np.ndarray, "height width"]
+    """The same with its holes filled from around; 0 off the subject."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -425,11 +426,14 @@ def _points(views: tuple[View, ...], maps: list[_Map], kept: list[Tensor]) -> Su
 
 def _full_size(view: View, map_: _Map, votes: Float[Tensor, "height width"]) -> DepthMap:
     """The window's measurements over the whole photograph."""
+    measured = votes > 0
+    # what no other photograph confirms still has a say in the filling, a hundredth as strong
+    weight = torch.where(measured, 1.0, 0.01) * map_.score.clamp(min=0) ** 2 * map_.window.subject
+    filled = filled_holes(map_.inverse_depth, weight)
     depth = np.zeros((view.camera.height, view.camera.width), np.float32)
-    confidence = np.zeros_like(depth)
+    guess = np.zeros_like(depth)
     height, width = votes.shape
     part = np.s_[map_.window.top : map_.window.top + height, map_.window.left : map_.window.left + width]
-    measured = votes > 0
     depth[part] = torch.where(measured, 1 / map_.inverse_depth.clamp(min=1e-6), 0.0).cpu().numpy()
-    confidence[part] = torch.where(measured, map_.score.clamp(0, 1), 0.0).cpu().numpy()
-    return DepthMap(depth=depth, confidence=confidence)
+    guess[part] = torch.where(map_.window.subject, 1 / filled.clamp(min=1e-6), 0.0).cpu().numpy()
+    return DepthMap(depth=depth, guess=guess)

@@ -12,13 +12,13 @@ from pathlib import Path
 import numpy as np
 import PIL.Image
 import pycolmap
-from jaxtyping import Float32, Float64, UInt8
+from jaxtyping import Float32, UInt8
 
-from ..errors import ErrorCode, ReconstructionError
 from ..images import fitted_size, read_image, resized
 from ..scene import Decision, Photo, Progress
 from .lens_refinement import refine_lenses
 from .lenses import PlacedPhoto, Placement, rigid_matrix, sparse_points
+from .parallax import require_parallax, why_none_placed
 
 LENS_MODEL = "SIMPLE_RADIAL"
 """One focal length, the principal point and one distortion coefficient. With separate focal lengths and four
@@ -31,12 +31,20 @@ _FEATURE_BUDGET = 48_000
 """Of all photographs together: with many, each needs fewer, and the time stays bounded."""
 _FEWEST_FEATURES = 2_500
 
+_FINE_PIXELS = 12_000_000
+"""Up to so many pixels in all photographs together, features are also sought at twice the resolution: three
+times the work, and half the error of three photographs' cameras. Eleven place each other as well without."""
+
 _MOST_THREADS = 4
 """Feature extraction holds about 0.4 GB a thread."""
 
+_BRIGHT_SHARE = 0.99
+_DARK_LEVEL = 0.4
+"""A photograph is dark where the bright share of its pixels is under this. Others stay as they are: more
+contrast would fill the places of fine features, which are the exact ones, with coarse ones."""
+_LARGEST_GAIN = 8.0
+
 _LARGEST_ERROR_PX = 2.0
-_SMALLEST_ANGLE_DEG = 1.0
-"""Under this, measured at the sparse points, the photographs are from one spot."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,7 +67,10 @@ _ATTEMPTS = (
     _Attempt(guided=True, initial_angle_deg=16.0, initial_inliers=100, further_inliers=30),
     _Attempt(guided=True, initial_angle_deg=6.0, initial_inliers=40, further_inliers=15),
 )
-"""Tried in this order until all photographs are placed."""
+"""Tried in this order until all photographs are placed, the guided ones until enough are."""
+
+_ENOUGH_SHARE = 0.75
+"""Of the photographs. Guided matching takes longer than all the rest, too long for a last photograph."""
 
 
 def estimate_placement(
@@ -83,13 +94,14 @@ def estimate_placement(
     sizes = [_write_picture(photo, folder / _picture_name(i), max_side_px) for i, photo in enumerate(photos)]
     num_features = min(max_features, max(_FEWEST_FEATURES, _FEATURE_BUDGET // len(photos)))
     groups = _lens_groups(photos, sizes)
+    _register_pictures(database, folder, groups)
     _extract_features(database, folder, groups, num_features, progress)
     model = _best_model(database, folder, workdir, len(photos), seed, progress)
     if model is None or model.num_reg_images() < 2:
-        raise _why_none_placed(database, len(photos))
+        raise why_none_placed(database, len(photos))
     decisions = refine_lenses(model)
     _drop_bad_points(model)
-    _require_parallax(model)
+    require_parallax(model, database)
     return _placement(model, photos, decisions)
 
 
@@ -124,8 +136,11 @@ def _write_picture(photo: Photo, path: Path, max_side_px: int) -> tuple[int, int
 
 
 def _grey(image_srgb: Float32[np.ndarray, "height width 3"]) -> UInt8[np.ndarray, "height width"]:
+    """Brightness, of a dark photograph raised: features are found by absolute contrast."""
     luma = image_srgb @ np.array([0.299, 0.587, 0.114], np.float32)  # ITU-R BT.601
-    grey: UInt8[np.ndarray, "height width"] = np.rint(luma * 255).astype(np.uint8)
+    level = float(np.quantile(luma, _BRIGHT_SHARE))
+    gain = min(1.0 / max(level, 1e-3), _LARGEST_GAIN) if level < _DARK_LEVEL else 1.0
+    grey: UInt8[np.ndarray, "height width"] = np.rint(np.minimum(gain * luma, 1.0) * 255).astype(np.uint8)
     return grey
 
 
@@ -149,6 +164,24 @@ def _num_threads() -> int:
     return max(1, min(_MOST_THREADS, os.cpu_count() or 1))
 
 
+def _register_pictures(database: Path, folder: Path, groups: Sequence[_LensGroup]) -> None:
+    """Enter pictures and lenses in order: the threads that extract would number them as they finish."""
+    pycolmap.Database.open(database).close()
+    for group in groups:
+        reader = pycolmap.ImageReaderOptions()
+        reader.camera_model = LENS_MODEL
+        reader.default_focal_length_factor = _UNKNOWN_FOCAL_FACTOR
+        if group.focal_px is not None:
+            reader.camera_params = f"{group.focal_px},{group.width / 2},{group.height / 2},0"
+        pycolmap.import_images(
+            database,
+            folder,
+            camera_mode=pycolmap.CameraMode.SINGLE,
+            image_names=list(group.names),
+            options=reader,
+        )
+
+
 def _extract_features(
     database: Path, folder: Path, groups: Sequence[_LensGroup], num_features: int, progress: Progress
 ) -> None:
@@ -156,40 +189,18 @@ def _extract_features(
     options.use_gpu = False
     options.num_threads = _num_threads()
     options.sift.max_num_features = num_features
-    num_all = sum(len(group.names) for group in groups)
-    num_done = 0
-    for group in groups:
-        reader = pycolmap.ImageReaderOptions()
-        reader.camera_model = LENS_MODEL
-        reader.default_focal_length_factor = _UNKNOWN_FOCAL_FACTOR
-        if group.focal_px is not None:
-            reader.camera_params = f"{group.focal_px},{group.width / 2},{group.height / 2},0"
-        for names in _batches(group.names, options.num_threads):
-            progress(0.5 * num_done / num_all, "Finding features")
-            pycolmap.extract_features(
-                database,
-                folder,
-                image_names=list(names),
-                camera_mode=pycolmap.CameraMode.SINGLE,
-                reader_options=reader,
-                extraction_options=options,
-                device=pycolmap.Device.cpu,
-            )
-            # The next batch goes through the same lens.
-            reader.existing_camera_id = _camera_of(database, names[0])
-            num_done += len(names)
-
-
-def _batches(names: Sequence[str], size: int) -> list[Sequence[str]]:
-    return [names[start : start + size] for start in range(0, len(names), size)]
-
-
-def _camera_of(database: Path, name: str) -> int:
-    with pycolmap.Database.open(database) as opened:
-        image = opened.read_image_with_name(name)
-    if image is None:
-        raise ValueError(f"{name=} is not in {database}")
-    return int(image.camera_id)
+    num_pixels = sum(group.width * group.height * len(group.names) for group in groups)
+    options.sift.first_octave = -1 if num_pixels <= _FINE_PIXELS else 0
+    names = [name for group in groups for name in group.names]
+    for start in range(0, len(names), options.num_threads):
+        progress(0.5 * start / len(names), "Finding features")
+        pycolmap.extract_features(
+            database,
+            folder,
+            image_names=names[start : start + options.num_threads],
+            extraction_options=options,
+            device=pycolmap.Device.cpu,
+        )
 
 
 def _match(database: Path, guided: bool, seed: int) -> None:
@@ -218,6 +229,9 @@ def _best_model(
     best: pycolmap.Reconstruction | None = None
     matched_guided: bool | None = None
     for number, attempt in enumerate(_ATTEMPTS):
+        num_wanted = num_photos * (_ENOUGH_SHARE if attempt.guided else 1.0)
+        if best is not None and best.num_reg_images() >= num_wanted:
+            break
         if attempt.guided != matched_guided:
             progress(0.5 + 0.1 * number, "Matching photographs")
             _match(database, attempt.guided, seed)
@@ -226,8 +240,6 @@ def _best_model(
         for model in _mapped(database, folder, workdir, attempt, seed, on_photo):
             if best is None or _merit(model) > _merit(best):
                 best = model
-        if best is not None and best.num_reg_images() == num_photos:
-            break
     return best
 
 
@@ -265,52 +277,10 @@ def _mapped(
     return list(models.values())
 
 
-def _why_none_placed(database: Path, num_photos: int) -> ReconstructionError:
-    """What the matches between pairs of photographs say about a failure."""
-    with pycolmap.Database.open(database) as opened:
-        _, geometries = opened.read_two_view_geometries()
-    kinds = pycolmap.TwoViewGeometryConfiguration
-    undone = {int(kinds.UNDEFINED), int(kinds.DEGENERATE)}
-    matched = [geometry.config for geometry in geometries if int(geometry.config) not in undone]
-    if not matched:
-        text = "The photographs have nothing in common that could be recognised."
-        remedy = "Take photographs that overlap by half, in steps of 10 to 20 degrees around the subject."
-        return ReconstructionError(ErrorCode.NO_OVERLAP, text, remedy)
-    flat = (kinds.PANORAMIC, kinds.PLANAR_OR_PANORAMIC, kinds.PLANAR)
-    if all(config in flat for config in matched):
-        return _no_parallax()
-    text = f"Fewer than 2 of {num_photos} photographs could be placed."
-    remedy = "Add photographs between those there are, or give the cameras."
-    return ReconstructionError(ErrorCode.TOO_FEW_PLACED, text, remedy)
-
-
-def _no_parallax() -> ReconstructionError:
-    text = "The photographs seem to be taken from one spot: nothing moves against its background."
-    remedy = "Walk around the subject; a step aside between photographs, not a turn."
-    return ReconstructionError(ErrorCode.NO_PARALLAX, text, remedy)
-
-
 def _drop_bad_points(model: pycolmap.Reconstruction) -> None:
     """Delete points whose mean reprojection error, as last updated, is large."""
     for point_id in [i for i, point in model.points3D.items() if point.error > _LARGEST_ERROR_PX]:
         model.delete_point3D(point_id)
-
-
-def _require_parallax(model: pycolmap.Reconstruction) -> None:
-    angles_deg = widest_angles_deg(model)
-    if len(angles_deg) == 0 or float(np.median(angles_deg)) < _SMALLEST_ANGLE_DEG:
-        raise _no_parallax()
-
-
-def widest_angles_deg(model: pycolmap.Reconstruction) -> Float64[np.ndarray, "points"]:
-    """For each point, the widest angle between the rays to it."""
-    centres = {i: model.images[i].projection_center() for i in model.reg_image_ids()}
-    angles = []
-    for point in model.points3D.values():
-        rays = np.stack([centres[element.image_id] - point.xyz for element in point.track.elements])
-        rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-        angles.append(np.degrees(np.arccos(np.clip((rays @ rays.T).min(), -1.0, 1.0))))
-    return np.array(angles, np.float64)
 
 
 def _placement(

@@ -12,20 +12,29 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 import torch.nn.functional as F
-from jaxtyping import Bool, Float, Float32, Int
+from jaxtyping import Bool, Float, Float32, Float64, Int
 from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 
 from ..maths import losses
-from ..maths.evidence import off_silhouette, point_distances, seen_through
-from ..maths.geometry import Pinhole, pinhole_in_object, ray_directions
-from ..maths.grid import interpolate, laplacian_at, locate, node_positions, refined, spacing, splat
+from ..maths.evidence import behind_front, off_silhouette, PointDistances, point_distances, seen_through
+from ..maths.geometry import Pinhole, pinhole_in_object, pixel_centres, project, ray_directions, unproject
+from ..maths.grid import Corners, interpolate, laplacian_at, locate, node_positions, refined, spacing, splat
+from ..maths.inverse_depth import fit_planes, normals_from_planes
 from ..maths.rays import Crossing, first_crossing, sphere_entry
 from ..maths.smooth_fit import fit_smooth
 from ..maths.volume import blending_weights, log_transmittance, log_transparency
+from ..errors import ErrorCode, ReconstructionError
 from ..scene import Decision, Progress, Region, SurfacePoints, View
 from .field import SurfaceField
 from .stereo import StereoResult
+
+
+GUESS = 0.01
+"""Weight of a filled-in depth beside a measured one."""
+ROUNDS = 5
+COARSEST = 48
+"""Nodes along each axis of the grid that finds the surface's extent."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,10 +56,12 @@ class TrainConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class Surface:
-    """The field at its finest level; object frame."""
+    """The field at its finest level."""
 
     distance: Float32[np.ndarray, "nodes nodes nodes"]
-    """Signed, object units, on nodes over [-1, 1]^3; > 0 outside."""
+    """Signed, on nodes over the cube [-1, 1]^3 of the grid frame and in its units; > 0 outside."""
+    grid_from_world: Float64[np.ndarray, "4 4"]
+    """A similarity: the cube is laid tightly around the surface."""
     decisions: tuple[Decision, ...] = ()
 
 
@@ -64,10 +75,13 @@ class _Scene:
     outlines: list[Float[Tensor, "height width"] | None]
     """Signed distance to the mask's outline in pixels, > 0 off the subject."""
     depths: list[Float[Tensor, "height width"]]
+    guesses: list[Float[Tensor, "height width"]]
     positions: Float[Tensor, "points 3"]
     normals: Float[Tensor, "points 3"]
     colours: Float[Tensor, "points 3"]
     confidence: Float[Tensor, "points"]
+    region_centre: Float[Tensor, "3"]
+    region_radius: float
 
 
 def fit_surface(
@@ -81,39 +95,73 @@ def fit_surface(
     progress: Progress,
 ) -> Surface:
     """The distance field that agrees with points, silhouettes and photographs."""
-    scene = _scene(views, region, stereo, device)
-    distance = _sphere_like(scene, config.levels[0])
+    progress(0.0, "finding the extent of the surface")
+    with torch.no_grad():
+        scene = _scene(views, region, region, stereo, device)
+        distance = _fit_level(scene, torch.maximum(_ball(scene, COARSEST), _free_distance(scene, COARSEST)), config)
+        frame = _tight_frame(distance, region)
+        scene = _scene(views, region, frame, stereo, device)
+        distance = torch.maximum(_ball(scene, config.levels[0]), _free_distance(scene, config.levels[0]))
     total = sum(config.steps) + 10 * len(config.levels)
     done = 0
-    for level, (nodes, steps) in enumerate(zip(config.levels, config.steps, strict=True)):
+    for nodes, steps in zip(config.levels, config.steps, strict=True):
         progress(done / total, f"fitting points on a grid of {nodes}^3")
         with torch.no_grad():
-            distance = _fit_level(scene, refined(distance, nodes), config, trust=0.0 if level == 0 else 1.0)
+            distance = _fit_level(scene, refined(distance, nodes), config)
         done += 10
         if steps:
             tell = _within(progress, done / total, (done + steps) / total)
             distance = _refine(scene, distance, steps, config, generator, tell)
             done += steps
-    return Surface(distance=distance.cpu().numpy())
+    return Surface(distance=distance.cpu().numpy(), grid_from_world=frame.object_from_world)
 
 
 def _within(progress: Progress, first: float, last: float) -> Progress:
     return lambda fraction, text: progress(first + (last - first) * fraction, text)
 
 
-def _scene(views: tuple[View, ...], region: Region, stereo: StereoResult, device: torch.device) -> _Scene:
+def _scene(
+    views: tuple[View, ...], region: Region, frame: Region, stereo: StereoResult, device: torch.device
+) -> _Scene:
+    """Everything measured, carried from the region's object frame to another frame."""
     points = stereo.points
+    frame_from_object = frame.object_from_world @ region.world_from_object
+    scale = region.radius_world / frame.radius_world
+    middle = torch.tensor(frame_from_object[:3, 3], dtype=torch.float32, device=device)
     return _Scene(
-        cameras=[pinhole_in_object(view.camera, region, device) for view in views],
+        cameras=[pinhole_in_object(view.camera, frame, device) for view in views],
         images=[torch.tensor(view.image_srgb, device=device).permute(2, 0, 1) for view in views],
         masks=[None if v.mask is None else torch.tensor(v.mask, device=device) for v in views],
         outlines=[None if v.mask is None else torch.tensor(_outline(v.mask), device=device) for v in views],
-        depths=[torch.tensor(map_.depth, device=device) for map_ in stereo.depth_maps],
-        positions=torch.tensor(points.positions, device=device),
+        depths=[torch.tensor(map_.depth * scale, device=device) for map_ in stereo.depth_maps],
+        guesses=[torch.tensor(map_.guess * scale, device=device) for map_ in stereo.depth_maps],
+        positions=torch.tensor(points.positions, device=device) * scale + middle,
         normals=torch.tensor(points.normals, device=device),
         colours=torch.tensor(points.colours_srgb, device=device),
         confidence=torch.tensor(points.confidence, device=device),
+        region_centre=middle,
+        region_radius=scale,
     )
+
+
+def _tight_frame(distance: Float[Tensor, "nodes nodes nodes"], region: Region) -> Region:
+    """The cube around the inside of a coarse field, as the unit cube of a frame of its own.
+
+    Raises ReconstructionError(NO_SURFACE) if there is no inside.
+    """
+    inside = torch.nonzero(distance < 0).float() * spacing(COARSEST) - 1
+    if not len(inside):
+        raise ReconstructionError(
+            ErrorCode.NO_SURFACE,
+            "No surface was found in the region.",
+            "Check that the photographs show the same thing, and that masks, if any, are white on it.",
+        )
+    low, high = inside.amin(dim=0), inside.amax(dim=0)
+    half = float((high - low).max()) / 2 + 2.5 * spacing(COARSEST)
+    frame_from_object = np.eye(4)
+    frame_from_object[:3, :3] /= half
+    frame_from_object[:3, 3] = -((low + high) / 2).cpu().double().numpy() / half
+    return Region(object_from_world=frame_from_object @ region.object_from_world)
 
 
 def _outline(mask: Float32[np.ndarray, "height width"]) -> Float32[np.ndarray, "height width"]:
@@ -129,56 +177,126 @@ def _outline(mask: Float32[np.ndarray, "height width"]) -> Float32[np.ndarray, "
 # --- the linear fit --------------------------------------------------------------------------------------
 
 
-def best_sphere(
-    positions: Float[Tensor, "points 3"], normals: Float[Tensor, "points 3"], weight: Float[Tensor, "points"]
-) -> tuple[Float[Tensor, "3"], Float[Tensor, ""]]:
-    """Centre and radius of the sphere with p = centre + radius n in the least squares sense.
+def _ball(scene: _Scene, nodes: int) -> Float[Tensor, "nodes nodes nodes"]:
+    """All that is known of backs: (|x - c|^2 - r^2) / 2r of the ball that explains the measured points.
 
-    For points all around it is the object's size; for points on one side, what their normals' turning says.
+    Least squares of p = c + r n over points and normals: for points all around it is the object's size,
+    for points on one side what the turning of their normals says. Where the photographs are taken from
+    sides far enough apart for silhouettes to bound the depth, it is as large as the subject is wide.
     """
-    share = (weight / weight.sum())[:, None]
-    mean_p, mean_n = (share * positions).sum(dim=0), (share * normals).sum(dim=0)
-    spread = (share * (normals - mean_n).square()).sum()
-    together = (share * (positions - mean_p) * (normals - mean_n)).sum()
-    radius = (together / spread.clamp(min=1e-6)).clamp(0.2, 0.7)
-    return mean_p - radius * mean_n, radius
+    weight = (scene.confidence / scene.confidence.sum())[:, None]
+    mean_p, mean_n = (weight * scene.positions).sum(dim=0), (weight * scene.normals).sum(dim=0)
+    spread = (weight * (scene.normals - mean_n).square()).sum()
+    together = (weight * (scene.positions - mean_p) * (scene.normals - mean_n)).sum()
+    widest = _half_width(scene, mean_p)
+    explained = float((together / spread.clamp(min=1e-6)).clamp(0.3 * widest, widest))
+    bounded = min(max((_widest_angle_deg(scene) - 50) / 40, 0.0), 1.0)
+    radius = explained + bounded * (widest - explained)
+    apart = node_positions(nodes, scene.positions.device) - (mean_p - radius * mean_n)
+    return (apart.square().sum(dim=-1) - radius * radius) / (2 * radius)
 
 
-def _sphere_like(scene: _Scene, nodes: int) -> Float[Tensor, "nodes nodes nodes"]:
-    """The start: what is known of nothing is a ball."""
-    centre, radius = best_sphere(scene.positions, scene.normals, scene.confidence)
-    return (node_positions(nodes, scene.positions.device) - centre).norm(dim=-1) - radius
+def _widest_angle_deg(scene: _Scene) -> float:
+    """Largest angle between two cameras, seen from the region's middle."""
+    directions = F.normalize(torch.stack([c.position for c in scene.cameras]) - scene.region_centre, dim=-1)
+    return math.degrees(math.acos(float((directions @ directions.T).min().clamp(-1, 1))))
+
+
+def _half_width(scene: _Scene, at: Float[Tensor, "3"]) -> float:
+    """Largest half extent of the subject across the views, at the distance of a point of it."""
+    widths = []
+    for camera, outline in zip(scene.cameras, scene.outlines, strict=True):
+        if outline is not None:
+            rows, columns = torch.nonzero(outline < 0, as_tuple=True)
+            middle_r, middle_c = (rows.max() + rows.min()) / 2, (columns.max() + columns.min()) / 2
+            reach_px = torch.hypot(rows - middle_r, columns - middle_c).max()
+            depth = project(camera, at)[1]
+            widths.append(float(reach_px * depth / camera.intrinsics[0, 0]))
+    return max(widths) if widths else 0.6 * scene.region_radius
 
 
 def _fit_level(
-    scene: _Scene, before: Float[Tensor, "nodes nodes nodes"], config: TrainConfig, *, trust: float
+    scene: _Scene, before: Float[Tensor, "nodes nodes nodes"], config: TrainConfig
 ) -> Float[Tensor, "nodes nodes nodes"]:
-    """The smoothest field near the points' planes, positive in free space, else like the level before.
+    """The smoothest field near the points' planes that silhouettes allow, else like the level before.
 
-    Free space is an inequality: it pulls only where the field says otherwise, which takes a few rounds.
+    Smooth is measured against a ball, whose curvature is free. Free space (f > 0) and silhouettes
+    (f < 0 somewhere on each ray) are inequalities: they pull only where the field says otherwise, which
+    takes a few rounds.
     """
     nodes = before.shape[0]
     h = spacing(nodes)
-    measured = point_distances(scene.positions, scene.normals, scene.confidence, nodes)
+    measured = point_distances(scene.positions, scene.normals, scene.confidence**3, nodes)
     measured_weight = measured.weight.clamp(max=4.0)
+    ball = _ball(scene, nodes)
     outside = _free_distance(scene, nodes)
     through = _seen_through_any(scene, nodes, 3 * h)
+    missed = torch.zeros((nodes**3, 1), device=before.device)
     distance = before
-    for _ in range(3):
+    for _ in range(ROUNDS):
         target, weight = before.clone(), torch.full_like(before, 1e-3 * (32 / nodes) ** 2)
         carved = distance < outside
         target[carved], weight[carved] = outside[carved], 0.5
         carved = through & (distance < 2 * h)
         target[carved], weight[carved] = 2 * h, 0.2
-        total = weight + measured_weight
-        target = (weight * target + measured_weight * measured.distance) / total
-        distance = fit_smooth(target, total, distance, smoothness=config.smoothness, steps=30)
+        missed += splat(*_missed_silhouettes(scene, distance), nodes)
+        pull = 0.2 * missed.reshape(distance.shape).clamp(max=1.0) * (outside < 0)
+        total = weight + measured_weight + pull
+        target = (weight * target + measured_weight * measured.distance - pull * h) / total
+        distance = ball + fit_smooth(
+            target - ball, total, distance - ball, smoothness=config.smoothness, steps=30
+        )
     return distance
+
+
+def _missed_silhouettes(
+    scene: _Scene, distance: Float[Tensor, "nodes nodes nodes"]
+) -> tuple[Float[Tensor, "rays 1"], Corners]:
+    """Rays through masks that miss the field's inside: ones, and the places where they come nearest to it."""
+    nodes = distance.shape[0]
+    places = []
+    for camera, outline in zip(scene.cameras, scene.outlines, strict=True):
+        if outline is None:
+            continue
+        step = max(1, round(float(spacing(nodes) * camera.intrinsics[0, 0] / camera.position.norm()) / 2))
+        rows, columns = torch.nonzero(outline[::step, ::step] < -0.5 * step, as_tuple=True)
+        pixels = torch.stack([columns, rows], dim=-1) * step + 0.5
+        directions = F.normalize(ray_directions(camera, pixels), dim=-1)
+        origins = camera.position.expand_as(directions)
+        crossing = first_crossing(
+            lambda x: interpolate(distance, locate(x, nodes)),
+            origins,
+            directions,
+            sphere_entry(origins / 1.75, directions) * 1.75,
+            shortest=0.5 * spacing(nodes),
+        )
+        missed = ~crossing.hit
+        places.append((origins + crossing.along[:, None] * directions)[missed])
+    points = torch.cat(places) if places else scene.positions[:0]
+    return torch.ones_like(points[:, :1]), locate(points, nodes)
+
+
+def _guessed_distances(scene: _Scene, nodes: int) -> PointDistances:
+    """First-order distances to the filled depth maps, every other pixel."""
+    parts = []
+    for camera, guess in zip(scene.cameras, scene.guesses, strict=True):
+        inverse_depth = torch.where(guess > 0, 1 / guess.clamp(min=1e-6), 0.0)
+        normals = normals_from_planes(fit_planes(inverse_depth, (guess > 0).float(), 4), camera)
+        pixels = pixel_centres(camera.width, camera.height, guess.device)
+        points = unproject(camera, pixels, guess)
+        facing = -(F.normalize(points - camera.position, dim=-1) * normals).sum(dim=-1)
+        good = (guess > 0) & (facing > 0.2)
+        good[1::2], good[:, 1::2] = False, False
+        parts.append((points[good], normals[good], 4 * facing[good]))
+    positions, normals, weight = (torch.cat(column) for column in zip(*parts, strict=True))
+    return point_distances(positions, normals, weight, nodes)
 
 
 def _free_distance(scene: _Scene, nodes: int) -> Float[Tensor, "nodes nodes nodes"]:
     """A lower bound of the distance: > 0 off any silhouette and outside the region, else no bound."""
-    bound = node_positions(nodes, scene.positions.device).norm(dim=-1) - 0.97
+    points = node_positions(nodes, scene.positions.device)
+    bound = (points - scene.region_centre).norm(dim=-1) - 0.97 * scene.region_radius
+    bound = torch.maximum(bound, points.abs().amax(dim=-1) - (1 - spacing(nodes)))
     for camera, outline in zip(scene.cameras, scene.outlines, strict=True):
         if outline is not None:
             bound = torch.maximum(bound, off_silhouette(camera, outline, nodes))

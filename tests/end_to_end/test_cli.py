@@ -24,85 +24,10 @@ from backend.wire.client import BackendProcess, clean_environment
 from backend.wire.protocol import Failed, Finished, Hello, Job, Message, decode
 
 ROOT = Path(__file__).resolve().parents[2]
+FAKE_STAGES = Path(__file__).with_name("fake_stages.py")
 STAGES = ["photos", "cameras", "region", "stereo", "train", "mesh"]
-RESULTS = {"mesh.ply", "mesh.glb", "points.ply", "cameras.json", "log.txt"}
+RESULTS = {"mesh.ply", "mesh.glb", "points.ply", "cameras.json", "report.json", "report.html", "log.txt"}
 posix_only = pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX")
-
-FAKE_STAGES = """
-import dataclasses, os, sys, time
-from pathlib import Path
-import numpy as np, torch
-from backend import pipeline
-from backend.scene import *
-
-TROUBLE, WHERE, STEP_S = sys.argv[1], sys.argv[2], float(sys.argv[3])
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class FakeStereo:
-    points: SurfacePoints
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class FakeSurface:
-    values: np.ndarray
-
-def work(name, progress):
-    print("noise of a library", name)
-    os.write(1, b"noise of a C library\\\\n")
-    with open(os.environ["DONE_LOG"], "a") as log:
-        log.write(name + "\\\\n")
-    for step in range(10):
-        progress(step / 10, f"{name} {step}")
-        time.sleep(STEP_S)
-        if name == WHERE and step == 5:
-            {"none": lambda: None, "internal": lambda: 1 / 0, "memory": fail_memory, "torch_memory": fail_torch,
-             "disk": fail_disk, "import": fail_import, "hang": lambda: time.sleep(60)}[TROUBLE]()
-
-def fail_memory(): raise MemoryError
-def fail_torch(): raise RuntimeError("[enforce fail at alloc_cpu.cpp:117] err == 0. DefaultCPUAllocator: can't allocate memory")
-def fail_disk(): raise OSError(28, "No space left on device")
-def fail_import(): raise ImportError("No module named 'pycolmap'", name="pycolmap")
-
-def load_photos(sources, masks, config, *, progress) -> tuple[Photo, ...]:
-    work("photos", progress)
-    image = np.zeros((4, 6, 3), np.float32)
-    return tuple(
-        Photo(name=p.name, path=p, image_srgb=image, mask=None, original_width=6, original_height=4, focal_px=None)
-        for p in sorted(sources[0].iterdir())
-    )
-
-def solve_cameras(photos, given, config, *, workdir, seed, progress) -> SolvedCameras:
-    (workdir / "database").touch()
-    work("cameras", progress)
-    camera = Camera(camera_from_world=np.eye(4), fx_px=5.0, fy_px=5.0, cx_px=3.0, cy_px=2.0, width=6, height=4)
-    views = tuple(View(name=p.name, camera=camera, image_srgb=p.image_srgb, mask=None) for p in photos[1:])
-    return SolvedCameras(views=views, unplaced=(photos[0].name,), estimated=True,
-        sparse_positions=np.zeros((0, 3)), sparse_visibility=np.zeros((0, len(views)), bool), reprojection_error_px=None)
-
-def find_region(solved, config, *, progress) -> Region:
-    work("region", progress)
-    return Region(object_from_world=np.eye(4))
-
-def match_views(views, region, config, *, device, progress) -> FakeStereo:
-    work("stereo", progress)
-    ones = np.ones((5, 3), np.float32)
-    return FakeStereo(points=SurfacePoints(positions=ones, normals=ones, colours_srgb=ones, confidence=ones[:, 0],
-        num_views=np.full(5, 2), view_index=np.zeros(5, np.int64)))
-
-def fit_surface(views, region, stereo, config, *, device, generator, progress) -> FakeSurface:
-    work("train", progress)
-    return FakeSurface(values=torch.rand(3, generator=generator, device=device).cpu().numpy())
-
-def extract_mesh(views, region, stereo, surface, config, *, device, progress) -> SurfaceMesh:
-    work("mesh", progress)
-    vertices = np.eye(3) * surface.values
-    return SurfaceMesh(vertices=vertices, faces=np.array([[0, 1, 2]]), normals=vertices.astype(np.float32),
-        colours_srgb=np.zeros((3, 3), np.uint8), support=np.ones(3, np.float32))
-
-pipeline.STAGES = dataclasses.replace(pipeline.STAGES, load_photos=load_photos, solve_cameras=solve_cameras,
-    find_region=find_region, match_views=match_views, fit_surface=fit_surface, extract_mesh=extract_mesh)
-from backend.__main__ import main
-sys.exit(main(sys.argv[4:]))
-""".replace("\\\\", "\\")
 
 
 class Case:
@@ -115,7 +40,6 @@ class Case:
         self.photos.mkdir()
         for index in range(3):
             Image.fromarray(np.full((4, 6, 3), 50 * index, np.uint8)).save(self.photos / f"{index}.png")
-        (folder / "fake.py").write_text(FAKE_STAGES)
 
     @property
     def environment(self) -> dict[str, str]:
@@ -126,7 +50,7 @@ class Case:
         }
 
     def command(self, trouble: str = "none", where: str = "none", step_s: float = 0.0) -> list[str]:
-        return [sys.executable, str(self.folder / "fake.py"), trouble, where, str(step_s), "reconstruct"]
+        return [sys.executable, str(FAKE_STAGES), trouble, where, str(step_s), "reconstruct"]
 
     def options(self, *more: str) -> list[str]:
         return [str(self.photos), "--output", str(self.output), "--device", "cpu", *more]

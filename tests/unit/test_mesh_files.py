@@ -60,6 +60,17 @@ def test_another_reader_sees_the_same_mesh(tmp_path: Path) -> None:
     assert found.volume > 0
 
 
+def test_the_header_names_every_property_and_its_size(tmp_path: Path) -> None:
+    write_mesh(tmp_path / "mesh.ply", random_mesh())
+    header = (tmp_path / "mesh.ply").read_bytes().partition(b"end_header")[0].decode("ascii").split("\n")
+    assert header[:2] == ["ply", "format binary_little_endian 1.0"]
+    assert [line.removeprefix("property ") for line in header if line.startswith("property")] == [
+        *("double x", "double y", "double z", "float nx", "float ny", "float nz"),
+        *("uchar red", "uchar green", "uchar blue", "float support"),
+        "list uchar int vertex_indices",
+    ]
+
+
 def test_the_same_mesh_gives_the_same_bytes(tmp_path: Path) -> None:
     for index in range(2):
         write_mesh(tmp_path / f"{index}.ply", random_mesh())

@@ -76,12 +76,12 @@ def test_concentric_spheres_are_apart_by_the_difference_of_their_radii() -> None
 
 @pytest.mark.parametrize(
     ("off_percent", "at_half", "at_one"),
-    [(0.4, 1.0, 1.0), (0.52, 0.0, 1.0), (0.94, 0.0, 1.0), (1.02, 0.0, 0.0)],
+    [(0.36, 1.0, 1.0), (0.52, 0.0, 1.0), (0.94, 0.0, 1.0), (1.02, 0.0, 0.0)],
 )
 def test_thresholds_of_the_f_scores(off_percent: float, at_half: float, at_one: float) -> None:
     """Concentric spheres so many percent of the diagonal apart; sampling adds up to 0.05 to that."""
     mesh = ball(1.0 + off_percent / 100 * 2 * np.sqrt(3))
-    found = surface_error(mesh, truth_of(ball()), cameras=None, seed=0, num_samples=150_000).whole
+    found = surface_error(mesh, truth_of(ball()), cameras=None, seed=0, num_samples=100_000).whole
     assert found.f_score_at_half_percent == pytest.approx(at_half, abs=0.05)
     assert found.f_score_at_one_percent == pytest.approx(at_one, abs=0.05)
 

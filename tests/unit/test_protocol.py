@@ -109,6 +109,13 @@ def test_a_missing_field_is_refused(name: str) -> None:
         decode(json.dumps({k: v for k, v in PROGRESS.items() if k != name}))
 
 
+def test_true_is_no_number() -> None:
+    stage = {"type": "stage", "name": "mesh", "index": 1, "count": 7}
+    assert decode(json.dumps(stage)) == protocol.Stage(name="mesh", index=1, count=7)
+    with pytest.raises(ProtocolError, match="index"):
+        decode(json.dumps({**stage, "index": True}))
+
+
 def test_a_repeated_key_is_refused() -> None:
     with pytest.raises(ProtocolError, match="repeated"):
         decode('{"type": "cancel", "type": "cancel"}')

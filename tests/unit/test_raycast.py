@@ -6,8 +6,10 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+import torch
 import trimesh
 
+from backend.maths.geometry import pinhole_in_object, pixel_centres, ray_directions
 from backend.maths.raycast import (
     RayCaster,
     camera_rays,
@@ -17,7 +19,7 @@ from backend.maths.raycast import (
     render_mesh,
     visible_from,
 )
-from backend.scene import Camera, SurfaceMesh
+from backend.scene import Camera, Region, SurfaceMesh, transform_points
 
 
 def camera_at(position: np.ndarray, *, focal_px: float = 80.0, width: int = 64, height: int = 48) -> Camera:
@@ -143,6 +145,21 @@ def test_camera_rays_project_back_to_their_pixel_centres() -> None:
     rows, columns = np.mgrid[: camera.height, : camera.width] + 0.5
     np.testing.assert_allclose(
         pixels[:, :2] / pixels[:, 2:], np.stack([columns, rows], -1).reshape(-1, 2), atol=1e-9
+    )
+
+
+def test_the_rays_that_fitting_uses_are_the_same() -> None:
+    """Both definitions of a pixel's ray: numpy in the world frame here, torch in the object frame there."""
+    camera = camera_at(np.array([1.0, -4.0, 2.0]))
+    turn = trimesh.transformations.rotation_matrix(0.7, [1, 2, 3])
+    region = Region(object_from_world=np.diag([0.25, 0.25, 0.25, 1.0]) @ turn)
+    pinhole = pinhole_in_object(camera, region, torch.device("cpu"))
+    theirs = ray_directions(pinhole, pixel_centres(camera.width, camera.height, torch.device("cpu")))
+    theirs = torch.nn.functional.normalize(theirs, dim=-1).reshape(-1, 3).numpy()
+    origins, directions = camera_rays(camera)
+    np.testing.assert_allclose(theirs, directions @ turn[:3, :3].T, atol=1e-6)
+    np.testing.assert_allclose(
+        pinhole.position.numpy(), transform_points(region.object_from_world, origins[0]), atol=1e-6
     )
 
 

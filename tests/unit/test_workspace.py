@@ -186,18 +186,21 @@ def test_a_folder_with_files_of_others_is_not_touched(tmp_path: Path) -> None:
     assert snapshot(tmp_path) == before
 
 
-def test_a_private_folder_of_others_is_not_touched(tmp_path: Path) -> None:
+@pytest.mark.parametrize("names", [("notes.txt",), ("notes.txt", "lock", "format.json.part")])
+def test_a_private_folder_of_others_is_not_touched(tmp_path: Path, names: tuple[str, ...]) -> None:
     (tmp_path / ".fewview").mkdir()
-    (tmp_path / ".fewview" / "notes.txt").write_text("mine")
+    for name in names:
+        (tmp_path / ".fewview" / name).write_text("mine")
     before = snapshot(tmp_path)
     assert refused(tmp_path).code is ErrorCode.OUTPUT_UNUSABLE
     assert snapshot(tmp_path) == before
 
 
-def test_what_a_kill_while_opening_leaves_is_ours(tmp_path: Path) -> None:
+@pytest.mark.parametrize("names", [(), ("lock",), ("lock", "format.json.part")])
+def test_what_a_kill_while_opening_leaves_is_ours(tmp_path: Path, names: tuple[str, ...]) -> None:
     (tmp_path / ".fewview").mkdir()
-    (tmp_path / ".fewview" / "lock").touch()
-    (tmp_path / ".fewview" / "format.json.part").touch()
+    for name in names:
+        (tmp_path / ".fewview" / name).touch()
     (tmp_path / ".DS_Store").touch()
     with open_workspace(tmp_path) as workspace:
         assert workspace.folder == tmp_path

@@ -1,0 +1,234 @@
+"""From the distance field to a mesh: level set, clean-up, fewer faces, colour and support.
+
+`support` tells measured surface from guesses: 0.7 for being measured by stereo points, 0.3 for
+being seen, both growing with how much evidence there is and saturating.
+"""
+
+from dataclasses import dataclass
+
+import fast_simplification
+import numpy as np
+import torch
+import trimesh
+from jaxtyping import Bool, Float32, Float64, Int64, UInt8
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+from skimage.measure import marching_cubes
+
+from ..errors import ErrorCode, ReconstructionError
+from ..maths.grid import near_surface, spacing
+from ..maths.raycast import RayCaster, visible_from
+from ..scene import Decision, Progress, Region, SurfaceMesh, View, transform_points
+from .stereo import StereoResult
+from .train import Surface
+
+Vertices = Float64[np.ndarray, "vertices 3"]
+Faces = Int64[np.ndarray, "faces 3"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class MeshConfig:
+    """What the mesh may look like."""
+
+    max_faces: int = 200_000
+    smallest_piece: float = 0.02
+    """Pieces with a smaller share of the largest one's area are dropped as floating."""
+
+
+def extract_mesh(
+    views: tuple[View, ...],
+    region: Region,
+    stereo: StereoResult,
+    surface: Surface,
+    config: MeshConfig,
+    *,
+    progress: Progress,
+) -> SurfaceMesh:
+    """The zero level as a coloured mesh in the world frame.
+
+    Raises ReconstructionError(NO_SURFACE) if the field has no zero level.
+    """
+    progress(0.0, "level set")
+    vertices, faces = level_set(surface)
+    faces = without_small_pieces(vertices, faces, config.smallest_piece)
+    vertices, faces = only_used(vertices, faces)
+    progress(0.2, "simplifying")
+    vertices, faces = simplified(vertices, faces, config.max_faces)
+    progress(0.4, "support and colour")
+    points = transform_points(region.world_from_object, stereo.points.positions.astype(np.float64))
+    cell = spacing(surface.distance.shape[0]) / np.cbrt(np.linalg.det(surface.grid_from_world[:3, :3]))
+    decisions: tuple[Decision, ...] = ()
+    normals = vertex_normals(vertices, faces)
+    seen = visible_from(vertices, normals, [view.camera for view in views], RayCaster(vertices, faces))
+    support = support_of(vertices, seen, points, stereo.points.confidence, cell)
+    if all(view.mask is None for view in views):
+        kept, decision = _open_or_closed(vertices, faces, support, region, cell)
+        decisions = (decision,)
+        used = np.unique(faces[kept])
+        vertices, faces = only_used(vertices, faces[kept])
+        normals, seen, support = normals[used], seen[used], support[used]
+    progress(0.7, "colour")
+    colours = vertex_colours(vertices, normals, seen, views)
+    return SurfaceMesh(
+        vertices=vertices,
+        faces=faces,
+        normals=normals.astype(np.float32),
+        colours_srgb=colours,
+        support=support,
+        decisions=decisions,
+    )
+
+
+def level_set(surface: Surface) -> tuple[Vertices, Faces]:
+    """Vertices (world frame) and faces (outward) of the zero level; only cells around it are visited."""
+    distance = surface.distance
+    nodes = distance.shape[0]
+    if not (distance.min() < 0 < distance.max()):
+        raise ReconstructionError(
+            ErrorCode.NO_SURFACE,
+            "The field has no surface.",
+            "Check that the photographs show the same thing, and that masks, if any, are white on it.",
+        )
+    near = near_surface(torch.from_numpy(distance), 2).numpy()
+    vertices, faces, _, _ = marching_cubes(
+        distance, 0.0, spacing=(spacing(nodes),) * 3, gradient_direction="descent", mask=near
+    )
+    world_from_grid = np.linalg.inv(surface.grid_from_world)
+    return transform_points(world_from_grid, vertices.astype(np.float64) - 1), faces.astype(np.int64)
+
+
+def face_areas(vertices: Vertices, faces: Faces) -> Float64[np.ndarray, "faces"]:
+    """Area of every face."""
+    a, b, c = (vertices[faces[:, k]] for k in range(3))
+    areas: Float64[np.ndarray, "faces"] = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
+    return areas
+
+
+def without_small_pieces(vertices: Vertices, faces: Faces, smallest: float) -> Faces:
+    """Faces of the connected pieces whose area is at least a share of the largest piece's."""
+    edges = faces[:, [0, 1, 1, 2]].reshape(-1, 2)
+    graph = coo_array((np.ones(len(edges), bool), edges.T), shape=(len(vertices),) * 2)
+    _, piece = connected_components(graph, directed=False)
+    area = np.bincount(piece[faces[:, 0]], weights=face_areas(vertices, faces), minlength=piece.max() + 1)
+    return faces[area[piece[faces[:, 0]]] >= smallest * area.max()]
+
+
+def only_used(vertices: Vertices, faces: Faces) -> tuple[Vertices, Faces]:
+    """Without the vertices that no face uses; the others keep their order."""
+    used, renumbered = np.unique(faces, return_inverse=True)
+    return vertices[used], renumbered.reshape(-1, 3).astype(np.int64)
+
+
+def simplified(vertices: Vertices, faces: Faces, max_faces: int) -> tuple[Vertices, Faces]:
+    """At most about `max_faces` faces by quadric edge collapse; a closed mesh stays closed.
+
+    Where the collapse would open a closed mesh, more faces are kept.
+    """
+    closed = trimesh.Trimesh(vertices, faces, process=False).is_watertight
+    target = max_faces
+    # single precision resolves a mesh of unit size at the origin best
+    middle, size = vertices.mean(axis=0), float(np.ptp(vertices, axis=0).max())
+    unit = ((vertices - middle) / size).astype(np.float32)
+    while target < len(faces):
+        points, fewer = fast_simplification.simplify(
+            unit, faces.astype(np.int32), target_count=target, agg=5, lossless=False
+        )
+        if not closed or trimesh.Trimesh(points, fewer, process=False).is_watertight:
+            return only_used(points.astype(np.float64) * size + middle, fewer.astype(np.int64))
+        target *= 2
+    return vertices, faces
+
+
+def vertex_normals(vertices: Vertices, faces: Faces) -> Float64[np.ndarray, "vertices 3"]:
+    """Unit normals, the mean of the faces around weighted by their area."""
+    a, b, c = (vertices[faces[:, k]] for k in range(3))
+    across = np.cross(b - a, c - a)
+    normals = np.stack(
+        [
+            np.bincount(faces.ravel(), weights=np.repeat(across[:, axis], 3), minlength=len(vertices))
+            for axis in range(3)
+        ],
+        axis=1,
+    )
+    length = np.linalg.norm(normals, axis=1, keepdims=True)
+    return normals / np.where(length > 0, length, 1.0)
+
+
+def support_of(
+    vertices: Vertices,
+    seen: Bool[np.ndarray, "vertices views"],
+    points: Float64[np.ndarray, "points 3"],
+    confidence: Float32[np.ndarray, "points"],
+    cell: float,
+) -> Float32[np.ndarray, "vertices"]:
+    """How well photographs back every vertex, 0 to 1 (see the module's first lines)."""
+    distance, nearest = cKDTree(points).query(vertices, k=min(8, len(points)), workers=-1)
+    near = np.exp(-((np.atleast_2d(distance.T).T / (1.5 * cell)) ** 2)) * confidence[np.atleast_2d(nearest.T).T]
+    measured = -np.expm1(-near.sum(axis=1))
+    looked_at = -np.expm1(-seen.sum(axis=1).astype(np.float64))
+    return (0.7 * measured + 0.3 * looked_at).astype(np.float32)
+
+
+def _open_or_closed(
+    vertices: Vertices,
+    faces: Faces,
+    support: Float32[np.ndarray, "vertices"],
+    region: Region,
+    cell: float,
+) -> tuple[Bool[np.ndarray, "faces"], Decision]:
+    """Which faces to keep where there are no masks.
+
+    If measured surface runs into the region's rim, the photographs show a piece of a larger scene, whose
+    back does not exist: surface far from any measurement is cut off. Otherwise the object stays closed.
+    """
+    measured = support > 0.35
+    from_centre = np.linalg.norm(vertices - region.centre_world, axis=1) / region.radius_world
+    at_rim = float((from_centre[measured] > 0.9).mean()) if measured.any() else 0.0
+    if at_rim < 0.01:
+        because = f"{at_rim:.1%} of the measured surface lies at the region's rim"
+        return np.ones(len(faces), bool), Decision(what="back side", choice="closed smoothly", because=because)
+    distance, _ = cKDTree(vertices[measured]).query(vertices, workers=-1)
+    keep_vertex = distance < 4 * cell
+    because = f"{at_rim:.0%} of the measured surface lies at the region's rim: a piece of a larger scene"
+    return keep_vertex[faces].all(axis=1), Decision(what="back side", choice="cut off", because=because)
+
+
+def vertex_colours(
+    vertices: Vertices,
+    normals: Float64[np.ndarray, "vertices 3"],
+    seen: Bool[np.ndarray, "vertices views"],
+    views: tuple[View, ...],
+) -> UInt8[np.ndarray, "vertices 3"]:
+    """Mean of the photographs that see a vertex, those that see it frontally first; others from around."""
+    total, weight = np.zeros((len(vertices), 3)), np.zeros(len(vertices))
+    for column, view in enumerate(views):
+        mine = np.flatnonzero(seen[:, column])
+        towards = view.camera.position - vertices[mine]
+        facing = (towards * normals[mine]).sum(axis=1) / np.linalg.norm(towards, axis=1)
+        share = np.clip(facing, 1e-3, 1) ** 4
+        total[mine] += share[:, None] * _colours_at(view, vertices[mine])
+        weight[mine] += share
+    known = weight > 0
+    colours = total / np.where(known, weight, 1.0)[:, None]
+    if known.any() and not known.all():
+        distance, nearest = cKDTree(vertices[known]).query(vertices[~known], k=min(16, int(known.sum())))
+        near = 1 / (np.atleast_2d(distance.T).T + 1e-3 * np.ptp(vertices))
+        mixed = (near[..., None] * colours[known][np.atleast_2d(nearest.T).T]).sum(axis=1)
+        colours[~known] = mixed / near.sum(axis=1, keepdims=True)
+    return np.clip(colours * 255 + 0.5, 0, 255).astype(np.uint8)
+
+
+def _colours_at(view: View, points: Vertices) -> Float64[np.ndarray, "points 3"]:
+    """Bilinear colours of the photograph where it shows the points; they must lie in front of it."""
+    homogeneous = transform_points(view.camera.camera_from_world, points) @ view.camera.intrinsics.T
+    pixel = homogeneous[:, :2] / homogeneous[:, 2:] - 0.5
+    limit = np.array([view.camera.width - 1, view.camera.height - 1])
+    low = np.clip(np.floor(pixel), 0, np.maximum(limit - 1, 0)).astype(int)
+    t = np.clip(pixel - low, 0, 1)
+    (x, y), (s, u) = low.T, t.T[..., None]
+    image, right, down = view.image_srgb, np.minimum(x + 1, limit[0]), np.minimum(y + 1, limit[1])
+    upper = image[y, x] * (1 - s) + image[y, right] * s
+    lower = image[down, x] * (1 - s) + image[down, right] * s
+    mixed: Float64[np.ndarray, "points 3"] = upper * (1 - u) + lower * u
+    return mixed

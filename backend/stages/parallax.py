@@ -1,0 +1,72 @@
+"""Whether the photographs move enough against each other, and why they could not be placed."""
+
+from pathlib import Path
+
+import numpy as np
+import PIL.Image  # noqa: F401 - pycolmap loaded before Pillow corrupts memory when Pillow next saves
+import pycolmap
+from jaxtyping import Float64
+
+from ..errors import ErrorCode, ReconstructionError
+
+_SMALLEST_ANGLE_DEG = 1.0
+_SMALLEST_ANGLE_FLAT_DEG = 2.0
+"""Under this, as the median at the sparse points, the photographs are from one spot. The second counts where
+a plane or a turn would explain every pair: a turn with the focal length unknown was seen to pass for 1.4."""
+
+_FLAT_KINDS = frozenset(
+    int(kind)
+    for kind in (
+        pycolmap.TwoViewGeometryConfiguration.PLANAR,
+        pycolmap.TwoViewGeometryConfiguration.PANORAMIC,
+        pycolmap.TwoViewGeometryConfiguration.PLANAR_OR_PANORAMIC,
+    )
+)
+
+
+def why_none_placed(database: Path, num_photos: int) -> ReconstructionError:
+    """What the matches between pairs of photographs say about a failure."""
+    kinds = _pair_kinds(database)
+    if not kinds:
+        text = "The photographs have nothing in common that could be recognised."
+        remedy = "Take photographs that overlap by half, in steps of 10 to 20 degrees around the subject."
+        return ReconstructionError(ErrorCode.NO_OVERLAP, text, remedy)
+    if kinds <= _FLAT_KINDS:
+        return _no_parallax()
+    text = f"Fewer than 2 of {num_photos} photographs could be placed."
+    remedy = "Add photographs between those there are, or give the cameras."
+    return ReconstructionError(ErrorCode.TOO_FEW_PLACED, text, remedy)
+
+
+def _pair_kinds(database: Path) -> set[int]:
+    """How the pairs of photographs that match are related."""
+    kinds = pycolmap.TwoViewGeometryConfiguration
+    with pycolmap.Database.open(database) as opened:
+        _, geometries = opened.read_two_view_geometries()
+    return {int(geometry.config) for geometry in geometries} - {int(kinds.UNDEFINED), int(kinds.DEGENERATE)}
+
+
+def _no_parallax() -> ReconstructionError:
+    text = "The photographs seem to be taken from one spot: nothing moves against its background."
+    remedy = "Walk around the subject; a step aside between photographs, not a turn."
+    return ReconstructionError(ErrorCode.NO_PARALLAX, text, remedy)
+
+
+def require_parallax(model: pycolmap.Reconstruction, database: Path) -> None:
+    """Raise NO_PARALLAX where the model is what noise and a wrong focal length make of a turning camera."""
+    flat = _pair_kinds(database) <= _FLAT_KINDS
+    smallest_deg = _SMALLEST_ANGLE_FLAT_DEG if flat else _SMALLEST_ANGLE_DEG
+    angles_deg = widest_angles_deg(model)
+    if len(angles_deg) == 0 or float(np.median(angles_deg)) < smallest_deg:
+        raise _no_parallax()
+
+
+def widest_angles_deg(model: pycolmap.Reconstruction) -> Float64[np.ndarray, "points"]:
+    """For each point, the widest angle between the rays to it."""
+    centres = {i: model.images[i].projection_center() for i in model.reg_image_ids()}
+    angles = []
+    for point in model.points3D.values():
+        rays = np.stack([centres[element.image_id] - point.xyz for element in point.track.elements])
+        rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+        angles.append(np.degrees(np.arccos(np.clip((rays @ rays.T).min(), -1.0, 1.0))))
+    return np.array(angles, np.float64)

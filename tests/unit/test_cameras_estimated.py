@@ -1,0 +1,226 @@
+"""Cameras from photographs of a rendered corner, and lens refinement on synthetic points."""
+
+import math
+from pathlib import Path
+
+import numpy as np
+import PIL.Image  # noqa: F401 - before pycolmap
+import pycolmap
+import pytest
+from scipy.ndimage import gaussian_filter
+from scipy.spatial.transform import Rotation
+
+from backend.errors import Cancelled, ErrorCode, ReconstructionError
+from backend.scene import Photo, SolvedCameras, no_progress
+from backend.stages.cameras import CamerasConfig, solve_cameras
+from backend.stages.lens_refinement import Gaussian, joined, refine_lenses
+from backend.stages.lenses import sampled
+
+WIDTH, HEIGHT, FOCAL_PX = 400, 300, 420.0
+CONFIG = CamerasConfig(max_features=1200)
+SLOPE = 0.8
+"""The scene is a ridge, z = SLOPE |x|, its edge towards the cameras at negative z."""
+
+
+@pytest.fixture(scope="module")
+def texture() -> np.ndarray:
+    rng = np.random.default_rng(0)
+    layers = [gaussian_filter(rng.normal(size=(1024, 1024)), s) * s for s in (1.5, 4.0, 12.0)]
+    grey = sum(layers) / np.std(sum(layers))
+    return np.clip(0.5 + 0.2 * grey, 0, 1).astype(np.float32)
+
+
+def look_at_origin(position: np.ndarray, turn_deg: float = 0.0) -> np.ndarray:
+    """camera_from_world of a camera that looks at the origin, then turned about its vertical axis."""
+    forward = -position / np.linalg.norm(position)
+    right = np.cross([0.0, 1.0, 0.0], forward)
+    right /= np.linalg.norm(right)
+    rotation = np.stack([right, np.cross(forward, right), forward])
+    rotation = Rotation.from_euler("y", turn_deg, degrees=True).as_matrix() @ rotation
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = rotation, -rotation @ position
+    return pose
+
+
+def arc_pose(angle_deg: float) -> np.ndarray:
+    angle = math.radians(angle_deg)
+    return look_at_origin(np.array([3 * math.sin(angle), 0.4 * math.sin(2 * angle), -3 * math.cos(angle)]))
+
+
+def render(texture: np.ndarray, camera_from_world: np.ndarray) -> np.ndarray:
+    """The ridge as seen through a pinhole with its principal point in the middle."""
+    columns, rows = np.meshgrid(np.arange(WIDTH) + 0.5 - WIDTH / 2, np.arange(HEIGHT) + 0.5 - HEIGHT / 2)
+    rays = np.stack([columns / FOCAL_PX, rows / FOCAL_PX, np.ones_like(rows)], axis=-1)
+    rays = rays @ camera_from_world[:3, :3]
+    origin = -camera_from_world[:3, :3].T @ camera_from_world[:3, 3]
+    nearest = np.full(rows.shape, np.inf)
+    for side in (-1.0, 1.0):
+        # side * SLOPE * x - z = 0, valid where x is on that side.
+        distance = (origin[2] - side * SLOPE * origin[0]) / (side * SLOPE * rays[..., 0] - rays[..., 2])
+        valid = (distance > 0) & ((origin[0] + distance * rays[..., 0]) * side >= 0)
+        nearest = np.where(valid, np.minimum(nearest, distance), nearest)
+    hit = origin + np.where(np.isfinite(nearest), nearest, 0.0)[..., None] * rays
+    along = hit[..., 0] * math.hypot(1, SLOPE)
+    grey = sampled(texture, np.stack([512 + 190 * along, 512 + 190 * hit[..., 1]], axis=-1))
+    return np.repeat(grey[..., None], 3, axis=2)
+
+
+def make_photo(name: str, image: np.ndarray, focal_px: float | None = None) -> Photo:
+    return Photo(
+        name=name,
+        path=Path(name),
+        image_srgb=image.astype(np.float32),
+        mask=None,
+        original_width=WIDTH,
+        original_height=HEIGHT,
+        focal_px=focal_px,
+    )
+
+
+def noise_photo(name: str, seed: int) -> Photo:
+    grey = gaussian_filter(np.random.default_rng(seed).random((HEIGHT, WIDTH)), 1.5)
+    grey = (grey - grey.min()) / np.ptp(grey)
+    return make_photo(name, np.repeat(grey[..., None], 3, axis=2))
+
+
+def solve(photos: list[Photo], workdir: Path, seed: int = 0) -> SolvedCameras:
+    return solve_cameras(photos, None, CONFIG, workdir=workdir, seed=seed, progress=no_progress)
+
+
+def rotation_error_deg(a: np.ndarray, b: np.ndarray) -> float:
+    return math.degrees(Rotation.from_matrix(a[:3, :3].T @ b[:3, :3]).magnitude())
+
+
+POSES = {f"{i}.png": arc_pose(angle) for i, angle in enumerate([-18.0, 0.0, 15.0])}
+
+
+@pytest.fixture(scope="module")
+def corner(texture: np.ndarray) -> list[Photo]:
+    return [make_photo(name, render(texture, pose)) for name, pose in POSES.items()]
+
+
+@pytest.mark.parametrize("focal_px", [None, FOCAL_PX * 1.03])
+def test_cameras_of_rendered_photographs(focal_px: float | None, corner: list[Photo], tmp_path: Path) -> None:
+    photos = [make_photo(photo.name, photo.image_srgb, focal_px) for photo in corner]
+    unrelated = noise_photo("noise.png", 5)
+    solved = solve([*photos, unrelated], tmp_path)
+    assert [view.name for view in solved.views] == list(POSES)
+    assert solved.unplaced == ("noise.png",)
+    assert solved.estimated
+    assert solved.reprojection_error_px is not None
+    assert solved.reprojection_error_px < 0.5
+    first, *others = solved.views
+    for view in others:
+        ours = view.camera.camera_from_world @ np.linalg.inv(first.camera.camera_from_world)
+        true = POSES[view.name] @ np.linalg.inv(POSES[first.name])
+        assert rotation_error_deg(ours, true) < 0.3, "a third of it is a pixel"
+        cosine = ours[:3, 3] @ true[:3, 3] / np.linalg.norm(ours[:3, 3]) / np.linalg.norm(true[:3, 3])
+        assert cosine > math.cos(math.radians(1.0))
+        assert view.camera.fx_px == pytest.approx(FOCAL_PX, rel=0.02)
+
+
+def test_sparse_points_project_to_what_sees_them(corner: list[Photo], tmp_path: Path) -> None:
+    """Every point is in front of the cameras that see it and inside their pictures."""
+    solved = solve(corner, tmp_path)
+    assert len(solved.sparse_positions) > 200
+    assert (solved.sparse_visibility.sum(axis=1) >= 2).all()
+    for index, view in enumerate(solved.views):
+        points = solved.sparse_positions[solved.sparse_visibility[:, index]]
+        in_camera = points @ view.camera.camera_from_world[:3, :3].T + view.camera.camera_from_world[:3, 3]
+        pixels = in_camera @ view.camera.intrinsics.T
+        pixels = pixels[:, :2] / pixels[:, 2:]
+        assert (in_camera[:, 2] > 0).all()
+        assert ((pixels > -2) & (pixels < (WIDTH + 2, HEIGHT + 2))).all()
+
+
+def test_the_same_seed_gives_the_same_bits(corner: list[Photo], tmp_path: Path) -> None:
+    one, other = solve(corner, tmp_path / "a", seed=3), solve(corner, tmp_path / "b", seed=3)
+    np.testing.assert_array_equal(one.sparse_positions, other.sparse_positions)
+    for view, again in zip(one.views, other.views, strict=True):
+        np.testing.assert_array_equal(view.camera.camera_from_world, again.camera.camera_from_world)
+        np.testing.assert_array_equal(view.camera.intrinsics, again.camera.intrinsics)
+        np.testing.assert_array_equal(view.image_srgb, again.image_srgb)
+
+
+def refusal(photos: list[Photo], workdir: Path) -> ErrorCode:
+    with pytest.raises(ReconstructionError) as caught:
+        solve(photos, workdir)
+    assert caught.value.remedy
+    return caught.value.code
+
+
+def test_photographs_of_nothing_in_common(tmp_path: Path) -> None:
+    photos = [noise_photo(f"{seed}.png", seed) for seed in range(3)]
+    assert refusal(photos, tmp_path) == ErrorCode.NO_OVERLAP
+
+
+@pytest.mark.parametrize("focal_px", [None, FOCAL_PX])
+def test_photographs_from_one_spot(focal_px: float | None, texture: np.ndarray, tmp_path: Path) -> None:
+    spot = np.array([0.6, 0.2, -2.8])
+    images = [render(texture, look_at_origin(spot, turn)) for turn in (-7.0, 0.0, 6.0)]
+    photos = [make_photo(f"{index}.png", image, focal_px) for index, image in enumerate(images)]
+    assert refusal(photos, tmp_path) == ErrorCode.NO_PARALLAX
+
+
+def test_progress_can_cancel(corner: list[Photo], tmp_path: Path) -> None:
+    shares: list[float] = []
+
+    def cancel(share: float, text: str) -> None:
+        shares.append(share)
+        if text == "Placing cameras":
+            raise Cancelled
+
+    with pytest.raises(Cancelled):
+        solve_cameras(corner, None, CONFIG, workdir=tmp_path, seed=0, progress=cancel)
+    assert shares == sorted(shares)
+
+
+def test_joined_beliefs() -> None:
+    """The mean is weighted by inverse variances; ignorance changes nothing; order does not matter."""
+    sure = Gaussian(mean=np.array([1.0]), covariance=np.array([[1.0]]))
+    unsure = Gaussian(mean=np.array([4.0]), covariance=np.array([[2.0]]))
+    both = joined(sure, unsure)
+    assert both.mean[0] == pytest.approx(2.0)
+    assert both.covariance[0, 0] == pytest.approx(2 / 3)
+    np.testing.assert_allclose(joined(unsure, sure).mean, both.mean)
+    ignorant = Gaussian(mean=np.array([99.0]), covariance=np.array([[1e12]]))
+    np.testing.assert_allclose(joined(sure, ignorant).mean, sure.mean, atol=1e-6)
+
+
+def synthetic_model(num_images: int, lens: list[float]) -> pycolmap.Reconstruction:
+    """Points and cameras all around them, seen through the lens to a third of a pixel."""
+    pycolmap.set_random_seed(1)
+    options = pycolmap.SyntheticDatasetOptions()
+    options.num_rigs, options.num_frames_per_rig, options.num_points3D = 1, num_images, 400
+    options.camera_width, options.camera_height = 1000, 800
+    options.camera_model_id = pycolmap.CameraModelId.SIMPLE_RADIAL
+    options.camera_params = lens
+    options.num_points2D_without_point3D = 0
+    model = pycolmap.synthesize_dataset(options)
+    noise = pycolmap.SyntheticNoiseOptions()
+    noise.point2D_stddev = 0.3
+    pycolmap.synthesize_noise(noise, model)
+    return model
+
+
+TRUE_LENS = [900.0, 506.0, 395.0, 0.03]
+
+
+def test_refinement_finds_the_lens() -> None:
+    model = synthetic_model(6, TRUE_LENS)
+    camera = next(iter(model.cameras.values()))
+    camera.params = [930.0, 500.0, 400.0, 0.0]
+    (decision,) = refine_lenses(model)
+    np.testing.assert_allclose(camera.params[:3], TRUE_LENS[:3], atol=1.5)
+    assert camera.params[3] == pytest.approx(TRUE_LENS[3], abs=0.01)
+    assert model.compute_mean_reprojection_error() < 0.5
+    assert "refined" in decision.choice
+
+
+def test_two_photographs_leave_the_lens_alone() -> None:
+    model = synthetic_model(2, TRUE_LENS)
+    camera = next(iter(model.cameras.values()))
+    camera.params = held = [930.0, 500.0, 400.0, 0.0]
+    (decision,) = refine_lenses(model)
+    np.testing.assert_array_equal(camera.params, held)
+    assert "930 px" in decision.choice

@@ -1,0 +1,79 @@
+"""Presets: the names agree everywhere, each is a real choice, and no setting is dead."""
+
+import ast
+import dataclasses
+import tomllib
+from pathlib import Path
+
+import pytest
+
+from backend.doctor import DEPENDENCIES
+from backend.presets import PRESETS, Settings
+from backend.stages.report import flat_settings
+from backend.version import VERSION
+from backend.wire import protocol
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def test_the_wire_and_the_presets_know_the_same_names() -> None:
+    assert tuple(PRESETS) == protocol.PRESETS
+    assert protocol.Job(protocol=1, images=(), output="").preset in PRESETS
+
+
+def test_presets_differ_from_each_other() -> None:
+    assert len(set(PRESETS.values())) == len(PRESETS)
+
+
+def test_more_detail_means_larger_pictures_finer_grids_and_more_faces() -> None:
+    def effort(settings: Settings) -> tuple[int, int, int]:
+        return settings.photos.max_side_px, max(settings.train.levels), settings.mesh.max_faces
+
+    fast, balanced, detailed = (effort(PRESETS[name]) for name in ("fast", "balanced", "detailed"))
+    assert all(a < b < c for a, b, c in zip(fast, balanced, detailed, strict=True))
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_each_level_of_a_preset_has_its_steps(name: str) -> None:
+    train = PRESETS[name].train
+    assert len(train.levels) == len(train.steps)
+    assert list(train.levels) == sorted(set(train.levels))
+
+
+def attributes_read() -> set[str]:
+    """Names of all attributes that the stages read."""
+    files = (ROOT / "backend" / "stages").glob("*.py")
+    nodes = [node for path in files for node in ast.walk(ast.parse(path.read_text()))]
+    return {node.attr for node in nodes if isinstance(node, ast.Attribute)}
+
+
+@pytest.mark.parametrize("name", [name for name, _ in flat_settings(Settings())])
+def test_every_setting_is_read_by_a_stage(name: str) -> None:
+    assert name.rpartition(".")[2] in attributes_read()
+
+
+def test_settings_are_told_apart_by_their_representation() -> None:
+    """Checkpoints are found by it."""
+    for preset in PRESETS.values():
+        for field in dataclasses.fields(preset):
+            assert "object at 0x" not in repr(getattr(preset, field.name))
+
+
+def test_the_version_is_the_same_everywhere() -> None:
+    assert tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"] == VERSION
+    assert tomllib.loads((ROOT / "blender_manifest.toml").read_text())["version"] == VERSION
+
+
+def test_doctor_knows_every_dependency() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    assert {line.split(">=")[0] for line in project["dependencies"]} == set(DEPENDENCIES.values())
+    assert list(DEPENDENCIES).index("PIL") < list(DEPENDENCIES).index("pycolmap")
+
+
+def test_the_tested_versions_are_in_the_allowed_ranges_and_carry_no_address() -> None:
+    lines = (ROOT / "constraints.txt").read_text().splitlines()
+    pinned = dict(line.split("==") for line in lines if not line.startswith("#"))
+    assert pinned["torch"] == "2.13.0"
+    names = {name.lower().replace("_", "-") for name in pinned}
+    assert set(DEPENDENCIES.values()) <= names
+    assert not any("://" in line or "@" in line or "+" in line for line in lines)
