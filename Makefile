@@ -22,7 +22,8 @@ $(DEMO)/scene/transforms.json: .venv-blender/.ready $(wildcard blender_scenes/*.
 
 test: .venv/.ready .venv-blender/.ready
 	$(BACKEND) -m pytest --ignore=tests/blender
-	$(BLENDER) -m pytest tests/blender
+	@# Blender's Python has no jaxtyping: its tests run without the shape checks of pyproject.toml.
+	$(BLENDER) -m pytest -o addopts="--strict-markers --import-mode=importlib" tests/blender
 
 check: .venv/.ready
 	$(BACKEND) -m ruff check

@@ -14,7 +14,10 @@ from torch import Tensor
 def window_sum(
     values: Float[Tensor, "*batch height width"], radius: int
 ) -> Float[Tensor, "*batch height width"]:
-    """Sum over the (2 radius + 1)^2 window around every pixel; nothing is added beyond the border."""
+    """Sum over the (2 radius + 1)^2 window around every pixel; nothing is added beyond the border.
+
+    ValueError if the image is not larger than the window along both axes.
+    """
     for axis in (-1, -2):
         running = values.cumsum(axis)
         count = values.shape[axis]

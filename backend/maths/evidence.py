@@ -59,7 +59,9 @@ def _offsets(first: int, last: int, device: torch.device) -> Int[Tensor, "offset
 
 def read_at_nodes(
     camera: Pinhole, image: Float[Tensor, "height width"], nodes: int, mode: str = "bilinear"
-) -> tuple[Float[Tensor, "nodes nodes nodes"], Float[Tensor, "nodes nodes nodes"], Bool[Tensor, "nodes nodes nodes"]]:
+) -> tuple[
+    Float[Tensor, "nodes nodes nodes"], Float[Tensor, "nodes nodes nodes"], Bool[Tensor, "nodes nodes nodes"]
+]:
     """What an image holds where it shows each node, each node's depth, and whether it is shown at all."""
     points = node_positions(nodes, image.device)
     pixel, depth = project(camera, points)
@@ -86,15 +88,3 @@ def seen_through(
     """Nodes that lie in front of what the photograph measured, by more than `margin`."""
     measured, depth, shown = read_at_nodes(camera, depth_map, nodes, mode="nearest")
     return shown & (measured > 0) & (depth < measured - margin)
-
-
-def behind_front(
-    camera: Pinhole, guess: Float[Tensor, "height width"], thickness: Float[Tensor, "height width"], nodes: int
-) -> Float[Tensor, "nodes nodes nodes"]:
-    """How far each node lies behind the back of a body of given thickness under the photograph's surface.
-
-    Negative within the body or in front of it; infinite where the photograph shows no surface.
-    """
-    front, depth, shown = read_at_nodes(camera, guess, nodes, mode="nearest")
-    thick, _, _ = read_at_nodes(camera, thickness, nodes)
-    return torch.where(shown & (front > 0), depth - front - thick, torch.inf)

@@ -66,6 +66,18 @@ def interpolate(grid: Float[Tensor, "nodes nodes nodes"], corners: Corners) -> F
     return (grid.reshape(-1)[corners.index] * corners.weight).sum(dim=-1)
 
 
+def read(
+    grid: Float[Tensor, "nodes nodes nodes"], points: Float[Tensor, "points 3"]
+) -> Float[Tensor, "points"]:
+    """The same as `interpolate`, faster, for a grid that needs no gradients."""
+    threads = 8  # torch spreads the batch axis over its threads
+    padded = F.pad(points, (0, 0, 0, -len(points) % threads)).flip(-1)
+    spread = padded.reshape(threads, 1, 1, -1, 3)
+    whole = grid[None, None].expand(threads, -1, -1, -1, -1)
+    values = F.grid_sample(whole, spread, padding_mode="border", align_corners=True)
+    return values.flatten()[: len(points)]
+
+
 def value_and_gradient(
     grid: Float[Tensor, "nodes nodes nodes"], corners: Corners
 ) -> tuple[Float[Tensor, "points"], Float[Tensor, "points 3"]]:

@@ -16,15 +16,17 @@ from .geometry import Pinhole, pixel_centres
 def fit_planes(
     inverse_depth: Float[Tensor, "height width"], weight: Float[Tensor, "height width"], radius: int
 ) -> Float[Tensor, "3 height width"]:
-    """Weighted least-squares plane around every pixel: (value at the pixel, slope in u, slope in v), per pixel.
+    """Weighted least-squares plane around every pixel: (value there, slope in u, slope in v), per pixel.
 
-    A weak prior pulls the slopes to 0, so that windows with hardly any weight stay finite.
+    A weak prior pulls the slopes to 0, so that windows with hardly any weight stay finite: by the share
+    0.01 / (0.01 + variance of the window's pixels), 0.5 % for a full window of radius 2. What is
+    measured where the weight is 0 has no say, whatever it is.
     """
     height, width = inverse_depth.shape
     pixels = pixel_centres(width, height, inverse_depth.device)
     u = pixels[..., 0] - width / 2
     v = pixels[..., 1] - height / 2
-    w = inverse_depth * (weight > 0)
+    w = torch.where(weight > 0, inverse_depth, 0.0)
     terms = torch.stack([weight, weight * u, weight * v, weight * w, weight * u * u, weight * u * v])
     terms = torch.cat([terms, torch.stack([weight * v * v, weight * u * w, weight * v * w])]).double()
     s = window_sum(terms, radius)
@@ -54,29 +56,7 @@ def normals_from_planes(
     n_z = value - slope_u * (pixels[..., 0] - k[0, 2]) - slope_v * (pixels[..., 1] - k[1, 2])
     # n . X = 1 > 0 for the point seen, so n points away from the camera
     normal = -torch.stack([n_x, n_y, n_z], dim=-1)
-    normal = normal / normal.norm(dim=-1, keepdim=True).clamp(min=1e-12)
-    return normal @ camera.camera_from_object[:3, :3]
-
-
-def filled_holes(
-    values: Float[Tensor, "height width"], weight: Float[Tensor, "height width"]
-) -> Float[Tensor, "height width"]:
-    """The map where it has weight; elsewhere the nearest weighted mean that is coarse enough to know.
-
-    Pull and push (Gortler et al., "The Lumigraph", 1996, section 3.4): means over ever larger squares,
-    then back down, each level filling what the finer one lacks.
-    """
-    height, width = values.shape
-    if min(height, width) < 2:
-        mean = (values * weight).sum() / weight.sum().clamp(min=1e-12)
-        return torch.full_like(values, float(mean))
-    stacked = torch.stack([values * weight, weight])[None]
-    pulled = F.avg_pool2d(stacked, 2, ceil_mode=True, count_include_pad=False)[0] * 4
-    coarse_weight = pulled[1]
-    coarse = filled_holes(pulled[0] / coarse_weight.clamp(min=1e-12), coarse_weight.clamp(max=1.0))
-    pushed = F.interpolate(coarse[None, None], size=(height, width), mode="bilinear")[0, 0]
-    trust = weight.clamp(max=1.0)
-    return trust * values + (1 - trust) * pushed
+    return F.normalize(normal, dim=-1) @ camera.camera_from_object[:3, :3]
 
 
 def parabola_offset(

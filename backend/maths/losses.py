@@ -38,13 +38,11 @@ def eikonal(gradient: Float[Tensor, "points 3"]) -> Float[Tensor, ""]:
     return (torch.sqrt((gradient * gradient).sum(dim=-1) + 1e-12) - 1).square().mean()
 
 
-def silhouette(
-    log_pass: Float[Tensor, "rays"], coverage: Float[Tensor, "rays"]
-) -> Float[Tensor, ""]:
+def silhouette(log_pass: Float[Tensor, "rays"], coverage: Float[Tensor, "rays"]) -> Float[Tensor, ""]:
     """Cross-entropy between a ray's opacity and the mask, from the log of the ray's transparency.
 
     With t = log transparency <= 0: -(1 - m) t - m log(1 - e^t). The second log is bounded by letting every
-    ray leak a thousandth of its light, far below what a mask can tell.
+    ray lose a thousandth of its light, far below what a mask can tell.
     """
     leak = 1e-3
     opacity = -torch.expm1(log_pass) * (1 - leak) + leak

@@ -34,13 +34,14 @@ def first_crossing(
     directions: Float[Tensor, "rays 3"],
     start: Float[Tensor, "rays"],
     *,
+    reach: float = 2.0,
     shortest: float = 0.005,
     steps: int = 40,
 ) -> Crossing:
     """Sphere tracing from `start`, at least `shortest` a step; the crossing by the secant.
 
     A ray that never meets the surface gets the place where it came nearest, so that the silhouette
-    can be moved towards or away from it. Rays end 2 units after their start (the region's width).
+    can be moved towards or away from it. Rays end `reach` after their start.
     """
     along = start.clone()
     before_along, before = along, torch.full_like(along, torch.inf)
@@ -55,5 +56,5 @@ def first_crossing(
         crossing = torch.where(new, before_along + share * (along - before_along), crossing)
         hit = hit | new
         before_along, before = along, here
-        along = (along + (0.95 * here).clamp(min=shortest)).minimum(start + 2.0)
+        along = (along + (0.95 * here).clamp(min=shortest)).minimum(start + reach)
     return Crossing(along=torch.where(hit, crossing, nearest_along), hit=hit)

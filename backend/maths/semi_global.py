@@ -28,7 +28,7 @@ def aggregate(
 def _scan_rows(
     cost: Float[Tensor, "steps lines planes"], small_step: float, large_step: Float[Tensor, "steps lines"]
 ) -> Float[Tensor, "steps lines planes"]:
-    """Path costs of scan lines that run along the first axis; kept bounded by subtracting each step's best."""
+    """Path costs of scan lines along the first axis; kept bounded by subtracting each step's best."""
     path = cost.clone()
     for step in range(1, len(cost)):
         before = path[step - 1]

@@ -5,7 +5,6 @@ linear (Calakli and Taubin, "SSD: smooth signed distance surface reconstruction"
 simplest discrete form): solved by conjugate gradients, to start from a coarser grid's solution.
 """
 
-import torch
 from jaxtyping import Float
 from torch import Tensor
 

@@ -10,7 +10,7 @@ Names, after NeuS (Wang et al., arXiv:2106.10689):
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from torch.nn.functional import logsigmoid
+from torch.nn.functional import logsigmoid, pad
 
 
 def log_transmittance(
@@ -27,7 +27,8 @@ def log_transmittance(
 
 def blending_weights(log_pass: Float[Tensor, "rays intervals"]) -> Float[Tensor, "rays intervals"]:
     """Weight of every interval: light that reaches it times what it absorbs."""
-    reaching = torch.exp(log_pass.cumsum(dim=-1) - log_pass)
+    # Summed over the intervals before, not over all less the own: that would lose them next to -1e7.
+    reaching = torch.exp(pad(log_pass[:, :-1].cumsum(dim=-1), (1, 0)))
     return -torch.expm1(log_pass) * reaching
 
 

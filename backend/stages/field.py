@@ -5,6 +5,8 @@ function of features on the same nodes, of the normal (which carries the shading
 and, where a scene is glossy, of the direction of view.
 """
 
+import math
+
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
@@ -86,6 +88,6 @@ class SurfaceField(nn.Module):
 
 
 def _uniform(shape: tuple[int, int], inputs: int, generator: torch.Generator, device: torch.device) -> Tensor:
-    """He's uniform start, drawn on the CPU so that every device starts alike."""
-    bound = (3.0 / inputs) ** 0.5
+    """Uniform start of variance 1 / inputs (LeCun), drawn on the CPU so that every device starts alike."""
+    bound = math.sqrt(3.0 / inputs)
     return ((torch.rand(shape, generator=generator) * 2 - 1) * bound).to(device)

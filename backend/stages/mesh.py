@@ -25,6 +25,8 @@ from .train import Surface
 
 Vertices = Float64[np.ndarray, "vertices 3"]
 Faces = Int64[np.ndarray, "faces 3"]
+KeptVertices = Float64[np.ndarray, "kept_vertices 3"]
+KeptFaces = Int64[np.ndarray, "kept_faces 3"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,12 +64,14 @@ def extract_mesh(
     normals = vertex_normals(vertices, faces)
     seen = visible_from(vertices, normals, [view.camera for view in views], RayCaster(vertices, faces))
     support = support_of(vertices, seen, points, stereo.points.confidence, cell)
+    kept = in_seen_pieces(faces, seen)
     if all(view.mask is None for view in views):
-        kept, decision = _open_or_closed(vertices, faces, support, region, cell)
+        measured_scene, decision = _open_or_closed(vertices, faces, support, region, cell)
+        kept &= measured_scene
         decisions = (decision,)
-        used = np.unique(faces[kept])
-        vertices, faces = only_used(vertices, faces[kept])
-        normals, seen, support = normals[used], seen[used], support[used]
+    used = np.unique(faces[kept])
+    vertices, faces = only_used(vertices, faces[kept])
+    normals, seen, support = normals[used], seen[used], support[used]
     progress(0.7, "colour")
     colours = vertex_colours(vertices, normals, seen, views)
     return SurfaceMesh(
@@ -91,7 +95,7 @@ def level_set(surface: Surface) -> tuple[Vertices, Faces]:
             "Check that the photographs show the same thing, and that masks, if any, are white on it.",
         )
     near = near_surface(torch.from_numpy(distance), 2).numpy()
-    vertices, faces, _, _ = marching_cubes(
+    vertices, faces, _, _ = marching_cubes(  # type: ignore[no-untyped-call]
         distance, 0.0, spacing=(spacing(nodes),) * 3, gradient_direction="descent", mask=near
     )
     world_from_grid = np.linalg.inv(surface.grid_from_world)
@@ -101,26 +105,46 @@ def level_set(surface: Surface) -> tuple[Vertices, Faces]:
 def face_areas(vertices: Vertices, faces: Faces) -> Float64[np.ndarray, "faces"]:
     """Area of every face."""
     a, b, c = (vertices[faces[:, k]] for k in range(3))
-    areas: Float64[np.ndarray, "faces"] = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
-    return areas
+    return np.asarray(np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2)
 
 
-def without_small_pieces(vertices: Vertices, faces: Faces, smallest: float) -> Faces:
+def without_small_pieces(vertices: Vertices, faces: Faces, smallest: float) -> KeptFaces:
     """Faces of the connected pieces whose area is at least a share of the largest piece's."""
+    piece = _piece_of_faces(faces, len(vertices))
+    area = np.bincount(piece, weights=face_areas(vertices, faces))
+    return np.asarray(faces[area[piece] >= smallest * area.max()])
+
+
+def in_seen_pieces(
+    faces: Faces, seen: Bool[np.ndarray, "vertices views"], least: float = 0.05
+) -> Bool[np.ndarray, "faces"]:
+    """True for faces of pieces of which a share is seen; of the largest piece always.
+
+    Silhouettes leave room behind the subject; what fills it there, hidden from all, is no object.
+    """
+    piece = _piece_of_faces(faces, len(seen))
+    count = np.bincount(piece)
+    num_seen = np.bincount(piece, weights=np.asarray(seen.any(axis=1))[faces].mean(axis=1))
+    real = num_seen >= least * count
+    real[count.argmax()] = True
+    return np.asarray(real[piece])
+
+
+def _piece_of_faces(faces: Faces, num_vertices: int) -> Int64[np.ndarray, "faces"]:
+    """Number of each face's connected piece."""
     edges = faces[:, [0, 1, 1, 2]].reshape(-1, 2)
-    graph = coo_array((np.ones(len(edges), bool), edges.T), shape=(len(vertices),) * 2)
+    graph = coo_array((np.ones(len(edges), bool), edges.T), shape=(num_vertices,) * 2)
     _, piece = connected_components(graph, directed=False)
-    area = np.bincount(piece[faces[:, 0]], weights=face_areas(vertices, faces), minlength=piece.max() + 1)
-    return faces[area[piece[faces[:, 0]]] >= smallest * area.max()]
+    return np.asarray(piece[faces[:, 0]], np.int64)
 
 
-def only_used(vertices: Vertices, faces: Faces) -> tuple[Vertices, Faces]:
+def only_used(vertices: Vertices, faces: Faces) -> tuple[KeptVertices, Faces]:
     """Without the vertices that no face uses; the others keep their order."""
     used, renumbered = np.unique(faces, return_inverse=True)
     return vertices[used], renumbered.reshape(-1, 3).astype(np.int64)
 
 
-def simplified(vertices: Vertices, faces: Faces, max_faces: int) -> tuple[Vertices, Faces]:
+def simplified(vertices: Vertices, faces: Faces, max_faces: int) -> tuple[KeptVertices, KeptFaces]:
     """At most about `max_faces` faces by quadric edge collapse; a closed mesh stays closed.
 
     Where the collapse would open a closed mesh, more faces are kept.
@@ -164,10 +188,11 @@ def support_of(
 ) -> Float32[np.ndarray, "vertices"]:
     """How well photographs back every vertex, 0 to 1 (see the module's first lines)."""
     distance, nearest = cKDTree(points).query(vertices, k=min(8, len(points)), workers=-1)
-    near = np.exp(-((np.atleast_2d(distance.T).T / (1.5 * cell)) ** 2)) * confidence[np.atleast_2d(nearest.T).T]
+    near = np.exp(-((np.atleast_2d(distance.T).T / (1.5 * cell)) ** 2))
+    near *= confidence[np.atleast_2d(nearest.T).T]
     measured = -np.expm1(-near.sum(axis=1))
     looked_at = -np.expm1(-seen.sum(axis=1).astype(np.float64))
-    return (0.7 * measured + 0.3 * looked_at).astype(np.float32)
+    return np.asarray(0.7 * measured + 0.3 * looked_at, np.float32)
 
 
 def _open_or_closed(
@@ -182,14 +207,15 @@ def _open_or_closed(
     If measured surface runs into the region's rim, the photographs show a piece of a larger scene, whose
     back does not exist: surface far from any measurement is cut off. Otherwise the object stays closed.
     """
-    measured = support > 0.35
+    measured = support > 0.5
     from_centre = np.linalg.norm(vertices - region.centre_world, axis=1) / region.radius_world
-    at_rim = float((from_centre[measured] > 0.9).mean()) if measured.any() else 0.0
-    if at_rim < 0.01:
+    at_rim = float((from_centre[measured] > 0.95).mean()) if measured.any() else 0.0
+    if at_rim < 0.05:
         because = f"{at_rim:.1%} of the measured surface lies at the region's rim"
-        return np.ones(len(faces), bool), Decision(what="back side", choice="closed smoothly", because=because)
+        decision = Decision(what="back side", choice="closed smoothly", because=because)
+        return np.ones(len(faces), bool), decision
     distance, _ = cKDTree(vertices[measured]).query(vertices, workers=-1)
-    keep_vertex = distance < 4 * cell
+    keep_vertex = distance < 8 * cell
     because = f"{at_rim:.0%} of the measured surface lies at the region's rim: a piece of a larger scene"
     return keep_vertex[faces].all(axis=1), Decision(what="back side", choice="cut off", because=because)
 
@@ -230,5 +256,4 @@ def _colours_at(view: View, points: Vertices) -> Float64[np.ndarray, "points 3"]
     image, right, down = view.image_srgb, np.minimum(x + 1, limit[0]), np.minimum(y + 1, limit[1])
     upper = image[y, x] * (1 - s) + image[y, right] * s
     lower = image[down, x] * (1 - s) + image[down, right] * s
-    mixed: Float64[np.ndarray, "points 3"] = upper * (1 - u) + lower * u
-    return mixed
+    return np.asarray(upper * (1 - u) + lower * u, np.float64)

@@ -112,7 +112,10 @@ def _unique_names(paths: Sequence[Path]) -> list[str]:
 def _load_photo(path: Path, name: str, mask_path: Path | None, config: PhotosConfig) -> Photo:
     decoded = read_image(path, config.max_side_px)
     height, width = decoded.image_srgb.shape[:2]
-    mask = decoded.mask if mask_path is None else _load_mask(mask_path, name, width, height)
+    if mask_path is None:
+        mask = decoded.mask if decoded.mask is None or is_outline(decoded.mask) else None
+    else:
+        mask = _load_mask(mask_path, name, width, height)
     if mask is not None and mask.max() == 0:
         text = f"The mask of {name} is empty: it leaves nothing of the photograph."
         raise ReconstructionError(ErrorCode.MASK_UNUSABLE, text, "Make the subject white and the rest black.")
@@ -125,6 +128,21 @@ def _load_photo(path: Path, name: str, mask_path: Path | None, config: PhotosCon
         original_height=decoded.original_height,
         focal_px=decoded.focal_px,
     )
+
+
+def is_outline(alpha: Float32[np.ndarray, "height width"]) -> bool:
+    """Whether an alpha channel cuts out a subject.
+
+    One that is opaque along most of a frame just inside the picture only marks pixels that hold nothing,
+    as undistortion and stitching leave them at the edges.
+    """
+    height, width = alpha.shape
+    inset = max(1, round(0.04 * min(height, width)))
+    inner = alpha[inset : height - inset, inset : width - inset] > 0.5
+    if min(inner.shape, default=0) < 2:
+        return True
+    frame = np.concatenate([inner[0], inner[-1], inner[:, 0], inner[:, -1]])
+    return bool(frame.mean() < 0.5)
 
 
 def _load_mask(path: Path, photo_name: str, width: int, height: int) -> Float32[np.ndarray, "height width"]:

@@ -7,7 +7,8 @@ points say where the photographs overlap; without those, the cameras' axes say w
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float64
+from jaxtyping import Bool, Float64, Int64
+from scipy.ndimage import label
 
 from ..errors import ErrorCode, ReconstructionError
 from ..scene import Camera, Decision, Progress, Region, SolvedCameras, View
@@ -64,8 +65,7 @@ def nearest_to_axes(cameras: list[Camera]) -> Float64[np.ndarray, "3"]:
         across = np.eye(3) - np.outer(axis, axis)
         system += across
         right += across @ camera.position
-    solution: Float64[np.ndarray, "3"] = np.linalg.lstsq(system, right, rcond=1e-9)[0]
-    return solution
+    return np.asarray(np.linalg.lstsq(system, right, rcond=1e-9)[0])
 
 
 def _of_cameras(cameras: list[Camera]) -> tuple[Float64[np.ndarray, "3"], float]:
@@ -132,14 +132,13 @@ def _of_masks(views: list[View], config: RegionConfig) -> tuple[Float64[np.ndarr
     """
     first_centre, first_radius = _first_guess(views)
     centre, radius = first_centre, first_radius
+    steps = np.linspace(-1, 1, config.hull_cells)
+    unit_cells = np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), axis=-1)
     for _ in range(3):
-        steps = np.linspace(-1, 1, config.hull_cells)
-        cells = (
-            np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), axis=-1).reshape(-1, 3) * radius
-            + centre
-        )
-        cells = cells[np.linalg.norm(cells - first_centre, axis=1) <= first_radius]
-        kept = cells[_in_all_masks(cells, views)]
+        cells = unit_cells * radius + centre
+        counts = _masks_around(cells.reshape(-1, 3), views).reshape(cells.shape[:3])
+        counts[np.linalg.norm(cells - first_centre, axis=-1) > first_radius] = 0
+        kept = cells[_without_ghosts(counts)]
         if not len(kept):
             raise ReconstructionError(
                 ErrorCode.NO_SURFACE,
@@ -150,6 +149,20 @@ def _of_masks(views: list[View], config: RegionConfig) -> tuple[Float64[np.ndarr
         centre = (low + high) / 2
         radius = float(np.linalg.norm(kept - centre, axis=1).max()) + 2 * radius / config.hull_cells
     return centre, radius
+
+
+def _without_ghosts(counts: Int64[np.ndarray, "x y z"]) -> Bool[np.ndarray, "x y z"]:
+    """Cells in at least two masks, in pieces that somewhere more than half of the best number show.
+
+    Between two cameras that face each other, near one of them, lies space that both masks hold and that
+    no other photograph shows: a piece of its own, in few masks.
+    """
+    piece, num_pieces = label(counts >= 2, np.ones((3, 3, 3)))
+    best = np.zeros(num_pieces + 1, np.int64)
+    np.maximum.at(best, piece.ravel(), counts.ravel())
+    best[0] = 0
+    real = (best > best.max() / 2)[piece]
+    return np.asarray(real, bool)
 
 
 def _first_guess(views: list[View]) -> tuple[Float64[np.ndarray, "3"], float]:
@@ -178,9 +191,9 @@ def _first_guess(views: list[View]) -> tuple[Float64[np.ndarray, "3"], float]:
     return centre, float(radius) * 1.5
 
 
-def _in_all_masks(points: Float64[np.ndarray, "points 3"], views: list[View]) -> Bool[np.ndarray, "points"]:
-    """True for points that no photograph shows off the subject, and that at least two show on it."""
-    off, on = np.zeros(len(points), bool), np.zeros(len(points), int)
+def _masks_around(points: Float64[np.ndarray, "points 3"], views: list[View]) -> Int64[np.ndarray, "points"]:
+    """How many photographs show each point on the subject; 0 where one shows it off the subject."""
+    off, on = np.zeros(len(points), bool), np.zeros(len(points), np.int64)
     for view in views:
         assert view.mask is not None
         in_camera = points @ view.camera.camera_from_world[:3, :3].T + view.camera.camera_from_world[:3, 3]
@@ -193,4 +206,4 @@ def _in_all_masks(points: Float64[np.ndarray, "points 3"], views: list[View]) ->
         inside[shown] = view.mask[pixel[shown, 1], pixel[shown, 0]] > 0.5
         off |= shown & ~inside
         on += inside
-    return ~off & (on >= min(2, len(views)))
+    return np.where(off, 0, on)

@@ -17,6 +17,7 @@ from jaxtyping import Bool, Float, Float32
 from torch import Tensor
 
 from ..errors import ErrorCode, ReconstructionError
+from ..maths.backdrop import empty_backdrop
 from ..maths.correlation import (
     PatchStatistics,
     correlation,
@@ -36,7 +37,7 @@ from ..maths.geometry import (
     unproject,
     warp_pixels,
 )
-from ..maths.inverse_depth import filled_holes, fit_planes, lowest_with_neighbours, normals_from_planes
+from ..maths.inverse_depth import fit_planes, lowest_with_neighbours, normals_from_planes
 from ..maths.semi_global import aggregate
 from ..scene import Decision, Progress, Region, SurfacePoints, View
 
@@ -53,10 +54,12 @@ class StereoConfig:
     """Depths tried there, at most."""
     patch_radius: int = 3
     """Half width of the patches, in pixels of the size at hand."""
-    min_correlation: float = 0.55
+    min_correlation: float = 0.3
     """Patches that agree less than this are not measurements."""
     max_reprojection_px: float = 1.0
     """How far a point may move when carried to another photograph's depth map and back."""
+    max_points: int = 500_000
+    """Points kept, evenly over all that are measured; depth maps keep every pixel."""
     noise: float = 1.2 / 255
     """Standard deviation of sensor and coding noise in a flat patch."""
 
@@ -67,8 +70,6 @@ class DepthMap:
 
     depth: Float32[np.ndarray, "height width"]
     """Along the camera's axis, object units; 0 where nothing was measured."""
-    guess: Float32[np.ndarray, "height width"]
-    """The same with its holes filled from around; 0 off the subject."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -119,7 +120,7 @@ def match_views(
             maps.append(_depth_map(pyramid, [pyramids[n] for n in neighbours[index]], config))
         progress(0.9, "comparing depth maps")
         kept = [_agreement(i, maps, neighbours, config) for i in range(len(maps))]
-        points = _points(views, maps, kept)
+        points = _points(views, maps, kept, config.max_points)
     _check_enough(points)
     depth_maps = tuple(
         _full_size(view, map_, agreed) for view, map_, agreed in zip(views, maps, kept, strict=True)
@@ -143,10 +144,13 @@ def _check_enough(points: SurfacePoints) -> None:
 def _pyramid(view: View, region: Region, config: StereoConfig, device: torch.device) -> list[_Window]:
     """The view's window at full size, half, quarter, ... until all depths can be tried."""
     camera = pinhole_in_object(view.camera, region, device)
-    image = torch.tensor(view.image_srgb, device=device).mean(dim=-1)
+    colours = torch.tensor(view.image_srgb, device=device).permute(2, 0, 1)
+    image = colours.mean(dim=0)
     subject = _sees_region(camera)
     if view.mask is not None:
         subject &= torch.tensor(view.mask > 0.5, device=device)
+    elif (empty := empty_backdrop(colours)) is not None:
+        subject &= ~empty
     left, top, width, height = _bounding_box(subject)
     camera = camera.cropped(left, top, width, height)
     grey = image[top : top + height, left : left + width]
@@ -175,11 +179,12 @@ def _sees_region(camera: Pinhole) -> Bool[Tensor, "height width"]:
     direction = F.normalize(far, dim=-1)
     along = -(direction @ camera.position)
     closest = (camera.position + along[..., None] * direction).norm(dim=-1)
-    return (closest < 1.0) & (along > 0)
+    meets: Bool[Tensor, "height width"] = (closest < 1.0) & (along > 0)
+    return meets
 
 
 def _bounding_box(subject: Bool[Tensor, "height width"]) -> tuple[int, int, int, int]:
-    """(left, top, width, height) around the pixels that are set, with room for patches; at least 16 pixels."""
+    """(left, top, width, height) around the pixels that are set, with room for patches; at least 16 px."""
     height, width = subject.shape
     rows = torch.nonzero(subject.any(dim=1)).flatten().tolist() or [0, height - 1]
     columns = torch.nonzero(subject.any(dim=0)).flatten().tolist() or [0, width - 1]
@@ -240,7 +245,7 @@ def _sweep(window: _Window, sources: list[_Window], config: StereoConfig) -> _Ma
     planes = torch.linspace(far, near, count, device=window.grey.device)
     chunks = [
         _scores(window, sources, chunk[:, None, None].expand(-1, *window.grey.shape), config)
-        for chunk in planes.split(16)
+        for chunk in planes.tensor_split(math.ceil(count / 16))
     ]
     score = torch.cat(chunks)
     gradient = window.grey.diff(dim=0, append=window.grey[-1:]).abs()
@@ -387,12 +392,13 @@ def _confirms(
     moved = (back_at - pixels).norm(dim=-1)
     step = 1 / own.inverse_depth.clamp(min=1e-6)
     relative = (back_depth - step).abs() / step
-    return (
-        ok & (score > config.min_correlation - 0.1) & (moved < config.max_reprojection_px) & (relative < 0.01)
-    )
+    confirmed: Bool[Tensor, "height width"] = ok & (score > config.min_correlation - 0.1)
+    confirmed &= (moved < config.max_reprojection_px) & (relative < 0.01)
+    return confirmed
 
 
-def _points(views: tuple[View, ...], maps: list[_Map], kept: list[Tensor]) -> SurfacePoints:
+def _points(views: tuple[View, ...], maps: list[_Map], kept: list[Tensor], max_points: int) -> SurfacePoints:
+    stride = max(1, math.ceil(sum(int((votes > 0).sum()) for votes in kept) / max_points))
     parts: list[list[Tensor]] = []
     for index, (view, map_, votes) in enumerate(zip(views, maps, kept, strict=True)):
         camera = map_.window.camera
@@ -408,7 +414,7 @@ def _points(views: tuple[View, ...], maps: list[_Map], kept: list[Tensor]) -> Su
         image = torch.tensor(view.image_srgb, device=votes.device).permute(2, 0, 1)
         corner = pixels.new_tensor([map_.window.left, map_.window.top])
         colours = sample_image(image, (pixels + corner)[None])[0].permute(1, 2, 0)
-        mask = mask & (facing > 0.05)
+        mask = mask & (facing > 0.05) & _every(stride, mask)
         number = torch.full_like(votes, index)
         parts.append(
             [positions[mask], normals[mask], colours[mask], confidence[mask], votes[mask], number[mask]]
@@ -424,16 +430,17 @@ def _points(views: tuple[View, ...], maps: list[_Map], kept: list[Tensor]) -> Su
     )
 
 
+def _every(stride: int, mask: Bool[Tensor, "height width"]) -> Bool[Tensor, "height width"]:
+    """One in `stride` of the pixels that are set, spread over rows and columns alike."""
+    number = mask.flatten().cumsum(0).reshape(mask.shape)
+    return mask & (number * 7919 % stride == 0)
+
+
 def _full_size(view: View, map_: _Map, votes: Float[Tensor, "height width"]) -> DepthMap:
     """The window's measurements over the whole photograph."""
     measured = votes > 0
-    # what no other photograph confirms still has a say in the filling, a hundredth as strong
-    weight = torch.where(measured, 1.0, 0.01) * map_.score.clamp(min=0) ** 2 * map_.window.subject
-    filled = filled_holes(map_.inverse_depth, weight)
     depth = np.zeros((view.camera.height, view.camera.width), np.float32)
-    guess = np.zeros_like(depth)
     height, width = votes.shape
     part = np.s_[map_.window.top : map_.window.top + height, map_.window.left : map_.window.left + width]
     depth[part] = torch.where(measured, 1 / map_.inverse_depth.clamp(min=1e-6), 0.0).cpu().numpy()
-    guess[part] = torch.where(map_.window.subject, 1 / filled.clamp(min=1e-6), 0.0).cpu().numpy()
-    return DepthMap(depth=depth, guess=guess)
+    return DepthMap(depth=depth)

@@ -16,25 +16,27 @@ from jaxtyping import Bool, Float, Float32, Float64, Int
 from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 
+from ..errors import ErrorCode, ReconstructionError
 from ..maths import losses
-from ..maths.evidence import behind_front, off_silhouette, PointDistances, point_distances, seen_through
-from ..maths.geometry import Pinhole, pinhole_in_object, pixel_centres, project, ray_directions, unproject
-from ..maths.grid import Corners, interpolate, laplacian_at, locate, node_positions, refined, spacing, splat
-from ..maths.inverse_depth import fit_planes, normals_from_planes
-from ..maths.rays import Crossing, first_crossing, sphere_entry
+from ..maths.backdrop import empty_backdrop
+from ..maths.evidence import off_silhouette, point_distances, seen_through
+from ..maths.geometry import Pinhole, pinhole_in_object, project, ray_directions
+from ..maths.grid import Corners, laplacian_at, locate, node_positions, read, refined, spacing, splat
+from ..maths.rays import first_crossing, sphere_entry
 from ..maths.smooth_fit import fit_smooth
 from ..maths.volume import blending_weights, log_transmittance, log_transparency
-from ..errors import ErrorCode, ReconstructionError
-from ..scene import Decision, Progress, Region, SurfacePoints, View
+from ..scene import Decision, Progress, Region, View
 from .field import SurfaceField
-from .stereo import StereoResult
+from .stereo import DepthMap, StereoResult
 
-
-GUESS = 0.01
-"""Weight of a filled-in depth beside a measured one."""
-ROUNDS = 5
 COARSEST = 48
 """Nodes along each axis of the grid that finds the surface's extent."""
+ROUNDS = 5
+"""How often the linear fit asks anew which inequalities are broken."""
+PRIOR = 1e-3
+"""Weight of the level before, at 32 nodes, beside measurements of about 1."""
+LEAST_RADIUS = 0.3
+"""Of the ball behind the surface, in half widths of the subject."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,7 +45,7 @@ class TrainConfig:
 
     levels: tuple[int, ...] = (32, 64, 128)
     """Nodes along each axis of the grids, coarse to fine."""
-    steps: tuple[int, ...] = (0, 0, 200)
+    steps: tuple[int, ...] = (0, 0, 100)
     """Gradient steps at each level."""
     rays: int = 1024
     """Rays of each step."""
@@ -74,8 +76,9 @@ class _Scene:
     masks: list[Float[Tensor, "height width"] | None]
     outlines: list[Float[Tensor, "height width"] | None]
     """Signed distance to the mask's outline in pixels, > 0 off the subject."""
+    backdrops: list[Float[Tensor, "height width"] | None]
+    """The same for an empty backdrop where there is no mask: > 0 on it; what is not on it may be anything."""
     depths: list[Float[Tensor, "height width"]]
-    guesses: list[Float[Tensor, "height width"]]
     positions: Float[Tensor, "points 3"]
     normals: Float[Tensor, "points 3"]
     colours: Float[Tensor, "points 3"]
@@ -98,7 +101,9 @@ def fit_surface(
     progress(0.0, "finding the extent of the surface")
     with torch.no_grad():
         scene = _scene(views, region, region, stereo, device)
-        distance = _fit_level(scene, torch.maximum(_ball(scene, COARSEST), _free_distance(scene, COARSEST)), config)
+        distance = _fit_level(
+            scene, torch.maximum(_ball(scene, COARSEST), _free_distance(scene, COARSEST)), config
+        )
         frame = _tight_frame(distance, region)
         scene = _scene(views, region, frame, stereo, device)
         distance = torch.maximum(_ball(scene, config.levels[0]), _free_distance(scene, config.levels[0]))
@@ -113,7 +118,43 @@ def fit_surface(
             tell = _within(progress, done / total, (done + steps) / total)
             distance = _refine(scene, distance, steps, config, generator, tell)
             done += steps
-    return Surface(distance=distance.cpu().numpy(), grid_from_world=frame.object_from_world)
+    return Surface(
+        distance=distance.cpu().numpy(),
+        grid_from_world=frame.object_from_world,
+        decisions=_decisions(scene, frame, config),
+    )
+
+
+def _decisions(scene: _Scene, frame: Region, config: TrainConfig) -> tuple[Decision, ...]:
+    """What was modelled and what was left out, with the measurement behind it."""
+    masks = sum(outline is not None for outline in scene.outlines)
+    backdrops = sum(backdrop is not None for backdrop in scene.backdrops)
+    angle_deg = _widest_angle_deg(scene)
+    cell = spacing(config.levels[-1]) * frame.radius_world
+    made = [
+        Decision(
+            what="grid",
+            choice=f"{config.levels[-1]} nodes along each side of a cube around the surface",
+            because=f"the preset; a cell is {cell:.3g} wide in the cameras' units",
+        ),
+        Decision(
+            what="silhouettes",
+            choice="used on both sides" if masks else ("carve only" if backdrops else "left out"),
+            because=f"{masks} photographs have masks, {backdrops} an empty backdrop",
+        ),
+        Decision(
+            what="depth of the unseen side",
+            choice="as deep as wide" if angle_deg > 90 else "continued from the measured curvature",
+            because=f"the photographs are taken from sides up to {angle_deg:.0f} degrees apart",
+        ),
+        Decision(what="background", choice="left out", because="rays that miss the subject are not rendered"),
+        Decision(
+            what="refinement by rendering",
+            choice=f"{sum(config.steps)} steps" if sum(config.steps) else "left out",
+            because="the preset",
+        ),
+    ]
+    return tuple(made)
 
 
 def _within(progress: Progress, first: float, last: float) -> Progress:
@@ -128,13 +169,14 @@ def _scene(
     frame_from_object = frame.object_from_world @ region.world_from_object
     scale = region.radius_world / frame.radius_world
     middle = torch.tensor(frame_from_object[:3, 3], dtype=torch.float32, device=device)
+    images = [torch.tensor(view.image_srgb, device=device).permute(2, 0, 1) for view in views]
     return _Scene(
         cameras=[pinhole_in_object(view.camera, frame, device) for view in views],
-        images=[torch.tensor(view.image_srgb, device=device).permute(2, 0, 1) for view in views],
+        images=images,
+        backdrops=[_backdrop(v, i, m) for v, i, m in zip(views, images, stereo.depth_maps, strict=True)],
         masks=[None if v.mask is None else torch.tensor(v.mask, device=device) for v in views],
         outlines=[None if v.mask is None else torch.tensor(_outline(v.mask), device=device) for v in views],
         depths=[torch.tensor(map_.depth * scale, device=device) for map_ in stereo.depth_maps],
-        guesses=[torch.tensor(map_.guess * scale, device=device) for map_ in stereo.depth_maps],
         positions=torch.tensor(points.positions, device=device) * scale + middle,
         normals=torch.tensor(points.normals, device=device),
         colours=torch.tensor(points.colours_srgb, device=device),
@@ -142,6 +184,17 @@ def _scene(
         region_centre=middle,
         region_radius=scale,
     )
+
+
+def _backdrop(view: View, image: Tensor, map_: DepthMap) -> Float[Tensor, "height width"] | None:
+    if view.mask is not None:
+        return None
+    empty = empty_backdrop(image)
+    if empty is None:
+        return None
+    # a shadow may be as dark as the backdrop: what stereo measured is not empty
+    empty &= torch.tensor(map_.depth == 0, device=image.device)
+    return torch.tensor(_outline(1 - empty.cpu().numpy().astype(np.float32)), device=image.device)
 
 
 def _tight_frame(distance: Float[Tensor, "nodes nodes nodes"], region: Region) -> Region:
@@ -171,7 +224,8 @@ def _outline(mask: Float32[np.ndarray, "height width"]) -> Float32[np.ndarray, "
         return np.where(on, -1e4, 1e4).astype(np.float32)
     signed: Float32[np.ndarray, "height width"] = distance_transform_edt(~on) - distance_transform_edt(on)
     # the transform counts from pixel centre to pixel centre; the outline lies half a pixel between them
-    return (signed - 0.5 * np.sign(signed)).astype(np.float32)
+    between: Float32[np.ndarray, "height width"] = (signed - 0.5 * np.sign(signed)).astype(np.float32)
+    return between
 
 
 # --- the linear fit --------------------------------------------------------------------------------------
@@ -189,7 +243,7 @@ def _ball(scene: _Scene, nodes: int) -> Float[Tensor, "nodes nodes nodes"]:
     spread = (weight * (scene.normals - mean_n).square()).sum()
     together = (weight * (scene.positions - mean_p) * (scene.normals - mean_n)).sum()
     widest = _half_width(scene, mean_p)
-    explained = float((together / spread.clamp(min=1e-6)).clamp(0.3 * widest, widest))
+    explained = float((together / spread.clamp(min=1e-6)).clamp(LEAST_RADIUS * widest, widest))
     bounded = min(max((_widest_angle_deg(scene) - 50) / 40, 0.0), 1.0)
     radius = explained + bounded * (widest - explained)
     apart = node_positions(nodes, scene.positions.device) - (mean_p - radius * mean_n)
@@ -234,7 +288,7 @@ def _fit_level(
     missed = torch.zeros((nodes**3, 1), device=before.device)
     distance = before
     for _ in range(ROUNDS):
-        target, weight = before.clone(), torch.full_like(before, 1e-3 * (32 / nodes) ** 2)
+        target, weight = before.clone(), torch.full_like(before, PRIOR * (32 / nodes) ** 2)
         carved = distance < outside
         target[carved], weight[carved] = outside[carved], 0.5
         carved = through & (distance < 2 * h)
@@ -264,11 +318,13 @@ def _missed_silhouettes(
         directions = F.normalize(ray_directions(camera, pixels), dim=-1)
         origins = camera.position.expand_as(directions)
         crossing = first_crossing(
-            lambda x: interpolate(distance, locate(x, nodes)),
+            lambda x: read(distance, x),
             origins,
             directions,
             sphere_entry(origins / 1.75, directions) * 1.75,
+            reach=3.5,
             shortest=0.5 * spacing(nodes),
+            steps=48,
         )
         missed = ~crossing.hit
         places.append((origins + crossing.along[:, None] * directions)[missed])
@@ -276,30 +332,16 @@ def _missed_silhouettes(
     return torch.ones_like(points[:, :1]), locate(points, nodes)
 
 
-def _guessed_distances(scene: _Scene, nodes: int) -> PointDistances:
-    """First-order distances to the filled depth maps, every other pixel."""
-    parts = []
-    for camera, guess in zip(scene.cameras, scene.guesses, strict=True):
-        inverse_depth = torch.where(guess > 0, 1 / guess.clamp(min=1e-6), 0.0)
-        normals = normals_from_planes(fit_planes(inverse_depth, (guess > 0).float(), 4), camera)
-        pixels = pixel_centres(camera.width, camera.height, guess.device)
-        points = unproject(camera, pixels, guess)
-        facing = -(F.normalize(points - camera.position, dim=-1) * normals).sum(dim=-1)
-        good = (guess > 0) & (facing > 0.2)
-        good[1::2], good[:, 1::2] = False, False
-        parts.append((points[good], normals[good], 4 * facing[good]))
-    positions, normals, weight = (torch.cat(column) for column in zip(*parts, strict=True))
-    return point_distances(positions, normals, weight, nodes)
-
-
 def _free_distance(scene: _Scene, nodes: int) -> Float[Tensor, "nodes nodes nodes"]:
-    """A lower bound of the distance: > 0 off any silhouette and outside the region, else no bound."""
+    """A lower bound of the distance: > 0 off any silhouette, before any empty backdrop and outside the
+    region; else no bound."""
     points = node_positions(nodes, scene.positions.device)
     bound = (points - scene.region_centre).norm(dim=-1) - 0.97 * scene.region_radius
     bound = torch.maximum(bound, points.abs().amax(dim=-1) - (1 - spacing(nodes)))
-    for camera, outline in zip(scene.cameras, scene.outlines, strict=True):
-        if outline is not None:
-            bound = torch.maximum(bound, off_silhouette(camera, outline, nodes))
+    for camera, outline, backdrop in zip(scene.cameras, scene.outlines, scene.backdrops, strict=True):
+        edge = outline if outline is not None else backdrop
+        if edge is not None:
+            bound = torch.maximum(bound, off_silhouette(camera, edge, nodes))
     return torch.where(bound > 0, bound, -math.inf)
 
 
@@ -332,7 +374,9 @@ def _worthy_pixels(scene: _Scene) -> _Pixels:
     ):
         near = outline < 8 if outline is not None else F.max_pool2d((depth > 0).float()[None], 5, 1, 2)[0] > 0
         rows, columns = torch.nonzero(near, as_tuple=True)
-        coverage = mask[rows, columns] if mask is not None else torch.full_like(rows, math.nan, dtype=torch.float32)
+        coverage = (
+            mask[rows, columns] if mask is not None else torch.full_like(rows, math.nan, dtype=torch.float32)
+        )
         where = torch.stack([columns, rows], dim=-1) + 0.5
         parts.append((torch.full_like(rows, index), where, image[:, rows, columns].T, coverage))
     view, where, colour, coverage = (torch.cat(column) for column in zip(*parts, strict=True))
@@ -361,15 +405,15 @@ def _refine(
     generator: torch.Generator,
     progress: Progress,
 ) -> Float[Tensor, "nodes nodes nodes"]:
-    field = SurfaceField(distance, band_cells=4, channels=6, view_dependent=True, generator=generator)
+    field = SurfaceField(distance, band_cells=4, channels=6, view_dependent=False, generator=generator)
     _colour_from_points(field, scene)
     pixels = _worthy_pixels(scene)
     h = spacing(field.nodes)
     optimiser = torch.optim.Adam(
         [
-            {"params": [field.distances], "lr": 0.03 * h},
-            {"params": [field.features], "lr": 0.05},
-            {"params": [field.first, field.first_bias, field.last, field.last_bias], "lr": 0.005},
+            {"params": [field.distances], "lr": 0.015 * h},
+            {"params": [field.features], "lr": 0.02},
+            {"params": [field.first, field.first_bias, field.last, field.last_bias], "lr": 0.01},
         ],
         betas=(0.9, 0.99),
         eps=1e-12,
@@ -383,7 +427,7 @@ def _refine(
         loss = _ray_loss(field, whole, scene, pixels, sharpness, config, generator)
         loss = loss + _point_loss(field, scene, config, generator) + _shape_loss(field, generator)
         optimiser.zero_grad(set_to_none=True)
-        loss.backward()
+        torch.autograd.backward(loss)
         optimiser.step()
         schedule.step()
     return field.whole()
@@ -392,7 +436,9 @@ def _refine(
 def _colour_from_points(field: SurfaceField, scene: _Scene) -> None:
     """Start the features' colour logits at the stereo points' colours."""
     weight = scene.confidence[:, None]
-    sums = splat(torch.cat([scene.colours * weight, weight], dim=-1), field.locate(scene.positions), field.nodes)
+    sums = splat(
+        torch.cat([scene.colours * weight, weight], dim=-1), field.locate(scene.positions), field.nodes
+    )
     mean = (scene.colours * weight).sum(dim=0) / weight.sum()
     colour = (sums[:, :3] + 1e-3 * mean) / (sums[:, 3:] + 1e-3)
     with torch.no_grad():
@@ -413,7 +459,7 @@ def _ray_loss(
     origins, directions = _rays(scene, pixels, chosen)
     with torch.no_grad():
         entry = sphere_entry(origins, directions)
-        crossing = first_crossing(lambda x: interpolate(whole, locate(x, field.nodes)), origins, directions, entry)
+        crossing = first_crossing(lambda x: read(whole, x), origins, directions, entry)
     h = spacing(field.nodes)
     spread = torch.linspace(-3, 3, config.edges, device=origins.device)
     jitter = torch.rand((config.rays, 1), generator=generator).to(origins.device) - 0.5
@@ -455,11 +501,11 @@ def _point_loss(
     at_query = losses.taylor_at_query(value, gradient, p - q)
     at_point = losses.taylor_at_point(value, scene.normals[chosen], p - q)
     both = losses.charbonnier(at_query / h, 0.5) + losses.charbonnier(at_point / h, 0.5)
-    return (scene.confidence[chosen] * both).mean()
+    return (scene.confidence[chosen] ** 3 * both).mean()
 
 
 def _shape_loss(field: SurfaceField, generator: torch.Generator) -> Float[Tensor, ""]:
     """Squared Laplacian at random nodes near the surface, in cells."""
     chosen = torch.randint(len(field.active), (8192,), generator=generator).to(field.active.device)
     bent = laplacian_at(field.node_values, field.active[chosen], field.nodes)
-    return 0.05 * (bent / spacing(field.nodes)).square().mean()
+    return 0.5 * (bent / spacing(field.nodes)).square().mean()

@@ -17,8 +17,8 @@ from typing import Any
 import numpy as np
 import torch
 
-from backend import pipeline
 from backend.__main__ import main
+from backend.commands import reconstruct
 from backend.scene import Camera, Photo, Progress, Region, SolvedCameras, SurfaceMesh, SurfacePoints, View
 
 
@@ -136,7 +136,10 @@ def extract_mesh(*earlier: Any, progress: Progress) -> SurfaceMesh:
     )
 
 
-if __name__ == "__main__":
+def resolve_and_replace(job: Any, base: Path) -> Any:
+    """Put the small stages in place as late as can be: the real ones are loaded when a run loads them."""
+    from backend import pipeline
+
     pipeline.STAGES = pipeline.Stages(
         load_photos=load_photos,
         solve_cameras=solve_cameras,
@@ -145,4 +148,10 @@ if __name__ == "__main__":
         fit_surface=fit_surface,  # type: ignore[arg-type]
         extract_mesh=extract_mesh,
     )
+    return real_resolve(job, base)
+
+
+if __name__ == "__main__":
+    real_resolve = reconstruct.resolve
+    reconstruct.resolve = resolve_and_replace
     sys.exit(main(sys.argv[4:]))

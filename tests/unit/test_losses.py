@@ -1,0 +1,127 @@
+"""Where each loss is zero, what it equals elsewhere, and that it stays finite."""
+
+import math
+
+import pytest
+import torch
+from torch import Tensor
+
+from backend.maths import losses
+
+
+def draw(*shape: int, seed: int = 0) -> Tensor:
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+def gradient_of(value: Tensor, at: Tensor) -> Tensor:
+    (gradient,) = torch.autograd.grad(value.sum(), at)
+    return gradient
+
+
+def test_taylor_residuals_vanish_on_a_plane() -> None:
+    """With f(q) = n . (q - p) both residuals are 0 wherever the query lies."""
+    normal = torch.nn.functional.normalize(draw(40, 3), dim=-1)
+    p_minus_q = draw(40, 3, seed=1)
+    distance = -(normal * p_minus_q).sum(dim=-1)
+    zero = torch.zeros(40, dtype=torch.float64)
+    torch.testing.assert_close(losses.taylor_at_point(distance, normal, p_minus_q), zero)
+    torch.testing.assert_close(losses.taylor_at_query(distance, normal, p_minus_q), zero)
+
+
+def test_taylor_residuals_of_a_sphere_are_of_second_order() -> None:
+    """f = |q| - 1; away from the point by e along the tangent, by e outwards: known in closed form."""
+    apart = 0.1
+    query = torch.tensor([[1 + apart, 0.0, 0.0], [1.0, apart, 0.0]], dtype=torch.float64)
+    point = torch.tensor([[1.0, 0.0, 0.0]], dtype=torch.float64)
+    reach = query.norm(dim=-1)
+    at_point = losses.taylor_at_point(reach - 1, point.expand(2, 3), point - query)
+    torch.testing.assert_close(at_point, torch.tensor([0.0, math.hypot(1, apart) - 1], dtype=torch.float64))
+    at_query = losses.taylor_at_query(reach - 1, query / reach[:, None], point - query)
+    tangent = 1 / math.hypot(1, apart) - 1
+    torch.testing.assert_close(at_query, torch.tensor([0.0, tangent], dtype=torch.float64))
+
+
+def test_charbonnier_is_a_square_near_zero_and_a_distance_far_away() -> None:
+    scale = 0.02
+    near, far = torch.tensor(1e-4, dtype=torch.float64), torch.tensor(-1e4, dtype=torch.float64)
+    assert losses.charbonnier(near, scale).item() == pytest.approx(1e-8 / (2 * scale), rel=1e-4)
+    assert losses.charbonnier(far, scale).item() == pytest.approx(1e4 - scale, rel=1e-9)
+    residual = draw(30)
+    torch.testing.assert_close(losses.charbonnier(residual, scale), losses.charbonnier(-residual, scale))
+
+
+def test_charbonnier_pulls_no_harder_than_one() -> None:
+    residual = torch.tensor([-1e4, -1.0, 0.0, 1.0, 1e4], requires_grad=True)
+    value = losses.charbonnier(residual, 0.02)
+    gradient = gradient_of(value, residual)
+    torch.testing.assert_close(gradient, torch.tensor([-1.0, -1.0, 0.0, 1.0, 1.0]), atol=1e-3, rtol=0)
+
+
+def test_eikonal_measures_the_length_of_gradients() -> None:
+    unit = torch.nn.functional.normalize(draw(20, 3), dim=-1)
+    assert losses.eikonal(unit).item() == pytest.approx(0, abs=1e-12)
+    assert losses.eikonal(3 * unit).item() == pytest.approx(4)
+    assert losses.eikonal(0 * unit).item() == pytest.approx(1, abs=1e-5)
+
+
+def test_eikonal_is_finite_where_the_gradient_vanishes() -> None:
+    gradient = torch.tensor([[0.0, 0, 0], [1e-20, 0, 0], [1e4, -1e4, 1e4]], requires_grad=True)
+    value = losses.eikonal(gradient)
+    assert value.isfinite()
+    slope = gradient_of(value, gradient)
+    assert slope.isfinite().all()
+    assert slope.abs().max() < 1e5
+
+
+@pytest.mark.parametrize("share", [0.0, 0.3, 1.0])
+def test_silhouette_is_the_cross_entropy(share: float) -> None:
+    """Against the plain formula, far from 0 and 1, where the bound of a thousandth hardly shows."""
+    transparency = torch.linspace(0.1, 0.9, 9, dtype=torch.float64)
+    coverage = torch.full_like(transparency, share)
+    plain = -(1 - coverage) * transparency.log() - coverage * (1 - transparency).log()
+    value = losses.silhouette(transparency.log(), coverage)
+    assert value.item() == pytest.approx(plain.mean().item(), abs=3e-3)
+
+
+def test_silhouette_is_zero_where_mask_and_ray_agree() -> None:
+    log_pass, coverage = torch.tensor([0.0, -1e4]), torch.tensor([0.0, 1.0])
+    assert losses.silhouette(log_pass, coverage).item() == pytest.approx(0, abs=1e-6)
+
+
+def test_silhouette_stays_finite_where_they_disagree_entirely() -> None:
+    """Fully clear on the subject, fully opaque off it; and it still says which way to go."""
+    log_pass = torch.tensor([0.0, -1e4], requires_grad=True)
+    value = losses.silhouette(log_pass, torch.tensor([1.0, 0.0]))
+    gradient = gradient_of(value, log_pass)
+    assert value.isfinite()
+    assert gradient.isfinite().all()
+    assert gradient[0] > 0  # less transparency lowers the loss
+    assert gradient[1] < 0
+
+
+def test_entropy_of_side_is_that_of_a_coin() -> None:
+    distance = torch.linspace(-0.5, 0.5, 21, dtype=torch.float64)
+    inside = torch.sigmoid(-8 * distance)
+    plain = -inside * inside.log() - (1 - inside) * (1 - inside).log()
+    torch.testing.assert_close(losses.entropy_of_side(distance, 8.0), plain)
+    assert losses.entropy_of_side(torch.zeros(1), 8.0).item() == pytest.approx(math.log(2))
+
+
+def test_entropy_of_side_is_finite_far_away() -> None:
+    distance = torch.tensor([-1e4, -1.0, 0.0, 1.0, 1e4], requires_grad=True)
+    value = losses.entropy_of_side(distance, 512.0)
+    assert value.isfinite().all()
+    assert gradient_of(value, distance).isfinite().all()
+    assert value[[0, -1]].abs().max() == 0
+
+
+def test_gradients_agree_with_finite_differences() -> None:
+    f, g, n = draw(4).requires_grad_(), draw(4, 3, seed=1).requires_grad_(), draw(4, 3, seed=2)
+    t, m = (-draw(4, seed=3).abs() - 0.1).requires_grad_(), draw(4, seed=4).sigmoid()
+    check = torch.autograd.gradcheck
+    assert check(lambda f, g: losses.taylor_at_query(f, g, n), (f, g))
+    assert check(lambda f: losses.taylor_at_point(f, n, n), f)
+    assert check(lambda f: losses.charbonnier(f, 0.1), f)
+    assert check(losses.eikonal, g)
+    assert check(lambda t: losses.silhouette(t, m), t)
+    assert check(lambda f: losses.entropy_of_side(f, 3.0), f)

@@ -1,0 +1,116 @@
+"""Sphere tracing against rays and spheres in closed form."""
+
+import math
+
+import pytest
+import torch
+from torch import Tensor
+
+from backend.maths.rays import first_crossing, sphere_entry
+
+RADIUS = 0.5
+
+
+def ball(points: Tensor) -> Tensor:
+    distance: Tensor = points.norm(dim=-1) - RADIUS
+    return distance
+
+
+def rays_towards(num: int, spread: float) -> tuple[Tensor, Tensor]:
+    """Rays from 3 units away towards places within `spread` of the origin."""
+    generator = torch.Generator().manual_seed(2)
+    origins = 3 * torch.nn.functional.normalize(torch.randn(num, 3, generator=generator), dim=-1)
+    targets = (torch.rand(num, 3, generator=generator) * 2 - 1) * spread
+    return origins, torch.nn.functional.normalize(targets - origins, dim=-1)
+
+
+def sphere_along(origins: Tensor, directions: Tensor, radius: float) -> tuple[Tensor, Tensor]:
+    """The nearest place to the centre along rays, and where they first meet the sphere (NaN: never)."""
+    middle = -(origins * directions).sum(dim=-1)
+    squared = radius**2 - (origins.square().sum(dim=-1) - middle**2)
+    return middle, middle - squared.sqrt()
+
+
+def test_sphere_entry_lies_on_the_unit_sphere() -> None:
+    origins, directions = rays_towards(500, 1.2)
+    middle, first = sphere_along(origins, directions, 1.0)
+    assert first.isnan().any()
+    assert first.isfinite().any()
+    expected = torch.where(first.isnan(), middle, first)
+    torch.testing.assert_close(sphere_entry(origins, directions), expected, atol=2e-3, rtol=0)
+
+
+@pytest.mark.parametrize("origin", [(0.0, 0.0, 0.0), (0.0, 0.2, 0.9), (0.0, 0.0, 3.0), (0.0, 2.0, 0.1)])
+def test_sphere_entry_is_the_start_inside_the_sphere_and_beyond_it(
+    origin: tuple[float, float, float],
+) -> None:
+    entry = sphere_entry(torch.tensor([origin]), torch.tensor([[0.0, 0.0, 1.0]]))
+    assert entry.item() == 0
+
+
+def test_tracing_finds_the_first_hit() -> None:
+    origins, directions = rays_towards(500, 0.8)
+    middle, first = sphere_along(origins, directions, RADIUS)
+    along = (origins + middle[:, None] * directions).norm(dim=-1)
+    found = first_crossing(ball, origins, directions, sphere_entry(origins, directions))
+    sure = (along - RADIUS).abs() > 1e-3  # a ray that just grazes may pass between two steps
+    assert (found.hit == first.isfinite())[sure].all()
+    deep = found.hit & (along < 0.95 * RADIUS)
+    assert 100 < deep.sum() < 450
+    torch.testing.assert_close(found.along[deep], first[deep], atol=1e-4, rtol=0)
+
+
+def test_a_ray_that_misses_gets_the_place_where_it_comes_nearest() -> None:
+    """As near as its steps are dense: they are at most as long as the distance there."""
+    origins, directions = rays_towards(500, 0.9)
+    middle, first = sphere_along(origins, directions, RADIUS)
+    found = first_crossing(ball, origins, directions, sphere_entry(origins, directions))
+    missed = first.isnan() & ~found.hit
+    assert missed.sum() > 50
+    nearest = ball(origins + middle[:, None] * directions)[missed]
+    assert ((found.along - middle)[missed].abs() <= 0.5 * nearest + 0.02).all()
+    reached = ball(origins + found.along[:, None] * directions)[missed]
+    assert (reached - nearest).max() < 0.03
+
+
+def test_a_start_inside_is_a_hit_there() -> None:
+    origins = torch.tensor([[0.0, 0.0, 0.1], [0.3, 0.0, 0.0]])
+    directions = torch.tensor([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0]])
+    start = torch.tensor([0.0, 0.1])
+    found = first_crossing(ball, origins, directions, start)
+    assert found.hit.all()
+    torch.testing.assert_close(found.along, start)
+
+
+def test_the_first_of_two_surfaces_is_taken() -> None:
+    def two(points: Tensor) -> Tensor:
+        ahead = torch.tensor([0.0, 0.0, 0.5])
+        return torch.minimum((points - ahead).norm(dim=-1), (points + ahead).norm(dim=-1)) - 0.2
+
+    found = first_crossing(two, torch.tensor([[0.0, 0, -2]]), torch.tensor([[0.0, 0, 1]]), torch.ones(1))
+    assert found.along.item() == pytest.approx(1.3, abs=1e-4)
+
+
+def test_rays_end_at_their_reach() -> None:
+    origins, directions = torch.tensor([[0.0, 0.0, -2.0]]), torch.tensor([[0.0, 0.0, 1.0]])
+    short = first_crossing(ball, origins, directions, torch.zeros(1), reach=1.4)
+    assert not short.hit.any()
+    assert short.along.item() == pytest.approx(1.4)
+    assert first_crossing(ball, origins, directions, torch.zeros(1), reach=1.6).hit.all()
+
+
+def test_a_distance_that_is_too_small_is_still_crossed_exactly() -> None:
+    """A field half as steep as it should be takes more steps to the same crossing."""
+    origins, directions = rays_towards(100, 0.2)
+    _, first = sphere_along(origins, directions, RADIUS)
+    found = first_crossing(lambda x: 0.5 * ball(x), origins, directions, sphere_entry(origins, directions))
+    assert found.hit.all()
+    torch.testing.assert_close(found.along, first, atol=1e-4, rtol=0)
+
+
+@pytest.mark.parametrize("constant", [1e4, -1e4, 0.0, math.inf])
+def test_a_field_without_a_surface_gives_finite_places(constant: float) -> None:
+    origins, directions = rays_towards(5, 0.2)
+    found = first_crossing(lambda x: torch.full_like(x[:, 0], constant), origins, directions, torch.ones(5))
+    assert found.along.isfinite().all()
+    assert (found.hit == (constant <= 0)).all()

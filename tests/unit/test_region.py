@@ -1,0 +1,215 @@
+"""The region holds the subject, is not much larger than it, and does not depend on the world's frame."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from backend.errors import ErrorCode, ReconstructionError
+from backend.scene import Camera, Region, SolvedCameras, no_progress, transform_points
+from backend.stages.region import RegionConfig, find_region, nearest_to_axes, weighted_quantile
+from tests.synthetic_scene import (
+    CENTRE,
+    DISTANCE,
+    SIZE,
+    Scene,
+    arc_cameras,
+    camera_at,
+    photographed,
+    ring_cameras,
+    surface_points,
+    true_mesh,
+)
+
+REACH = 1.1 * SIZE
+"""Of the body from its centre, along x."""
+
+
+def region_of(solved: SolvedCameras, config: RegionConfig | None = None) -> Region:
+    return find_region(solved, config or RegionConfig(), progress=no_progress)
+
+
+def share_inside(region: Region) -> float:
+    """Of the true surface."""
+    in_object = transform_points(region.object_from_world, np.asarray(true_mesh().vertices))
+    return float((np.linalg.norm(in_object, axis=1) < 1).mean())
+
+
+def surface_samples(count: int, seed: int = 0) -> np.ndarray:
+    directions = np.random.default_rng(seed).normal(size=(count, 3))
+    return surface_points(directions / np.linalg.norm(directions, axis=1, keepdims=True))
+
+
+def without_images(cameras: list[Camera], **changes: object) -> SolvedCameras:
+    """Solved views of cameras whose pictures do not matter."""
+    small = [replace(camera.resized(24, 18)) for camera in cameras]
+    scene: Scene = photographed(small)
+    return replace(scene.without_masks().solved(), **changes)  # type: ignore[arg-type]
+
+
+# from masks
+
+
+def test_masks_all_around_give_the_bounding_sphere() -> None:
+    region = region_of(photographed(ring_cameras(6, 160)).solved())
+    assert share_inside(region) == 1.0
+    assert np.linalg.norm(region.centre_world - CENTRE) < 0.1 * SIZE
+    assert REACH < region.radius_world < 1.35 * REACH
+
+
+@pytest.mark.parametrize("spread_deg", [20.0, 60.0])
+def test_masks_from_a_narrow_arc_hold_the_subject(spread_deg: float) -> None:
+    region = region_of(photographed(arc_cameras(3, spread_deg, 160)).solved())
+    assert share_inside(region) > 0.999
+    assert np.linalg.norm(region.centre_world - CENTRE) < 0.6 * SIZE
+    assert region.radius_world < 2 * REACH
+
+
+def test_masks_of_two_views_are_enough() -> None:
+    assert share_inside(region_of(photographed(arc_cameras(2, 40, 160)).solved())) > 0.999
+
+
+def test_a_photograph_that_cuts_the_subject_off_does_not_cut_the_region() -> None:
+    """Space that a photograph does not show is not off its mask."""
+    narrow = replace(camera_at(35, 0.6, 160), cx_px=-20.0)
+    scene = photographed([*arc_cameras(3, 90, 160), narrow])
+    assert 0.05 < scene.coverage[-1].mean() < 0.5
+    assert share_inside(region_of(scene.solved())) == 1.0
+
+
+def test_the_region_moves_with_the_world() -> None:
+    """A similarity of the whole world carries the region with it."""
+    solved = photographed(arc_cameras(4, 90, 120)).solved()
+    scale, shift = 3.0, np.array([5.0, -2.0, 1.0])
+    moved = []
+    for view in solved.views:
+        camera_from_world = view.camera.camera_from_world.copy()
+        camera_from_world[:3, 3] = scale * camera_from_world[:3, 3] - camera_from_world[:3, :3] @ shift
+        moved.append(replace(view, camera=replace(view.camera, camera_from_world=camera_from_world)))
+    before, after = region_of(solved), region_of(replace(solved, views=tuple(moved)))
+    np.testing.assert_allclose(after.centre_world, scale * before.centre_world + shift, atol=1e-6)
+    np.testing.assert_allclose(after.radius_world, scale * before.radius_world, rtol=1e-6)
+
+
+def test_an_empty_mask_is_told_by_name() -> None:
+    solved = photographed(arc_cameras(3, 40, 80)).solved()
+    empty = replace(solved.views[1], mask=np.zeros_like(solved.views[1].image_srgb[..., 0]))
+    with pytest.raises(ReconstructionError, match="view_01") as raised:
+        region_of(replace(solved, views=(solved.views[0], empty, solved.views[2])))
+    assert raised.value.code == ErrorCode.MASK_UNUSABLE
+
+
+def test_masks_in_conflict_are_told() -> None:
+    """At the same height, rays through the top rows of one and the bottom rows of the other never meet."""
+    first, _, second = photographed(arc_cameras(3, 30, 80)).views
+    top, bottom = np.zeros((2, 60, 80), np.float32)
+    top[:8], bottom[-8:] = 1, 1
+    solved = photographed(arc_cameras(2, 30, 80)).solved()
+    views = (replace(first, mask=top), replace(second, mask=bottom))
+    with pytest.raises(ReconstructionError) as raised:
+        region_of(replace(solved, views=views))
+    assert raised.value.code == ErrorCode.NO_SURFACE
+
+
+# from points
+
+
+def test_points_on_the_subject_give_its_sphere() -> None:
+    region = region_of(without_images(arc_cameras(3, 40, 80), **sparse(surface_samples(400))))
+    assert share_inside(region) > 0.93
+    assert np.linalg.norm(region.centre_world - CENTRE) < 0.25 * SIZE
+    assert region.radius_world < 1.3 * REACH
+
+
+def test_few_outliers_hardly_change_the_region() -> None:
+    points = surface_samples(400)
+    far = CENTRE + np.random.default_rng(1).normal(size=(20, 3)) * 40 * SIZE
+    clean = region_of(without_images(arc_cameras(3, 40, 80), **sparse(points)))
+    noisy = region_of(without_images(arc_cameras(3, 40, 80), **sparse(np.vstack([points, far]))))
+    assert np.linalg.norm(noisy.centre_world - clean.centre_world) < 0.1 * SIZE
+    assert noisy.radius_world / clean.radius_world == pytest.approx(1.0, abs=0.15)
+
+
+def test_a_background_that_two_views_see_yields_to_a_subject_that_all_see() -> None:
+    """A fifth of the points lie on a wall behind; each is seen by two of five photographs."""
+    points = surface_samples(400)
+    wall = (
+        CENTRE + np.array([0.0, 12 * SIZE, 0.0]) + np.random.default_rng(2).normal(size=(100, 3)) * 4 * SIZE
+    )
+    visibility = np.ones((500, 5), bool)
+    visibility[400:, 2:] = False
+    found = sparse(np.vstack([points, wall]))
+    region = region_of(without_images(arc_cameras(5, 60, 80), **{**found, "sparse_visibility": visibility}))
+    assert np.linalg.norm(region.centre_world - CENTRE) < 0.3 * SIZE
+    assert region.radius_world < 1.6 * REACH
+
+
+def sparse(points: np.ndarray) -> dict[str, np.ndarray]:
+    return {"sparse_positions": points, "sparse_visibility": np.ones((len(points), 3), bool)}
+
+
+# from cameras alone
+
+
+def test_cameras_alone_give_what_all_of_them_show() -> None:
+    cameras = arc_cameras(4, 90, 80)
+    region = region_of(without_images(cameras))
+    np.testing.assert_allclose(region.centre_world, CENTRE, atol=1e-9)
+    # from the centre to the nearest side of the frustum: top or bottom of a 4:3 picture
+    slope = min((0.49 * 60) / (1.44 * 80), (0.51 * 60) / (1.44 * 80))
+    expected = DISTANCE * SIZE * np.sin(np.arctan(slope))
+    assert region.radius_world == pytest.approx(expected, rel=0.02)
+
+
+def test_cameras_that_look_apart_are_told() -> None:
+    looking_in = camera_at(0, 0.6, 80)
+    turned = np.diag([-1.0, 1.0, -1.0, 1.0]) @ camera_at(90, 0.6, 80).camera_from_world
+    away = replace(camera_at(90, 0.6, 80), camera_from_world=turned)
+    with pytest.raises(ReconstructionError, match="common place") as raised:
+        region_of(without_images([looking_in, away]))
+    assert raised.value.code == ErrorCode.CAMERAS_UNUSABLE
+
+
+def test_axes_that_meet_meet_there() -> None:
+    np.testing.assert_allclose(nearest_to_axes(arc_cameras(5, 120, 80)), CENTRE, atol=1e-9)
+
+
+def test_skew_axes_are_nearest_in_the_middle() -> None:
+    """One axis along x at z = 0, one along y at z = 2: (0, 0, 1) is one away from both."""
+
+    def looking(axis: list[float], up: list[float], position: list[float]) -> Camera:
+        rotation = np.stack([np.cross(up, axis), up, axis])
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = rotation, -rotation @ np.array(position)
+        return replace(camera_at(0, 0, 80), camera_from_world=pose)
+
+    cameras = [looking([1, 0, 0], [0, 0, 1], [-3, 0, 0]), looking([0, 1, 0], [0, 0, 1], [0, -5, 2])]
+    np.testing.assert_allclose(nearest_to_axes(cameras), [0, 0, 1], atol=1e-12)
+
+
+# given
+
+
+def test_a_given_sphere_is_taken() -> None:
+    config = RegionConfig(centre_world=(1.0, 2.0, 3.0), radius_world=4.0)
+    region = region_of(photographed(arc_cameras(2, 40, 80)).solved(), config)
+    np.testing.assert_allclose(region.centre_world, [1, 2, 3])
+    assert region.radius_world == pytest.approx(4.0)
+    assert region.decisions[0].because == "set by the user"
+
+
+# the weighted quantile
+
+quantities = arrays(np.float64, 12, elements=st.floats(-100, 100))
+whole_weights = arrays(np.int64, 12, elements=st.integers(1, 5))
+
+
+@settings(max_examples=50, deadline=None)
+@given(quantities, whole_weights, st.floats(0.01, 1.0))
+def test_a_weight_counts_as_so_many_copies(values: np.ndarray, weights: np.ndarray, share: float) -> None:
+    copies = np.sort(np.repeat(values, weights))
+    rank = int(np.ceil(share * len(copies) - 1e-9)) - 1
+    assert weighted_quantile(values, weights.astype(np.float64), share) == copies[max(rank, 0)]

@@ -1,0 +1,242 @@
+"""Depth maps and points against the truth they were drawn from; no points where nothing can be measured."""
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+import torch
+
+from backend.errors import Cancelled, ErrorCode, ReconstructionError
+from backend.scene import View, no_progress, transform_points
+from backend.stages.stereo import StereoConfig, StereoResult, match_views
+from tests.synthetic_scene import (
+    SIZE,
+    Scene,
+    arc_cameras,
+    diagonal,
+    photographed,
+    surface_distance,
+    texture_srgb,
+    true_normals,
+    true_region,
+)
+
+OBJECT_UNIT = 1.2 * SIZE
+"""Of the region's object frame, in world units."""
+
+
+def match(views: tuple[View, ...]) -> StereoResult:
+    return match_views(views, true_region(), StereoConfig(), device=torch.device("cpu"), progress=no_progress)
+
+
+@cache
+def scene() -> Scene:
+    return photographed(arc_cameras(3, 30, 160))
+
+
+@cache
+def matched() -> StereoResult:
+    return match(scene().views)
+
+
+def world_points(result: StereoResult) -> np.ndarray:
+    return transform_points(true_region().world_from_object, result.points.positions.astype(np.float64))
+
+
+def errors_percent(result: StereoResult) -> np.ndarray:
+    """Distance of the points from the true surface, in percent of the body's diagonal."""
+    return np.asarray(100 * np.abs(surface_distance(world_points(result))) / diagonal())
+
+
+def noise(view: View, seed: int, deviation: float = 1 / 255) -> View:
+    random = np.random.default_rng(seed).normal(size=view.image_srgb.shape) * deviation
+    return replace(view, image_srgb=np.clip(view.image_srgb + random, 0, 1).astype(np.float32))
+
+
+# accuracy
+
+
+def test_depth_maps_are_true() -> None:
+    """Median and 95 % in percent of the diagonal; a pixel here is 0.7 % wide."""
+    for found, truth in zip(matched().depth_maps, scene().depths, strict=True):
+        measured = (found.depth > 0) & np.isfinite(truth)
+        apart = 100 * np.abs(found.depth[measured] * OBJECT_UNIT - truth[measured]) / diagonal()
+        assert np.median(apart) < 0.12
+        assert np.quantile(apart, 0.95) < 0.9
+
+
+def test_most_of_what_two_photographs_show_is_measured() -> None:
+    for found, covered in zip(matched().depth_maps, scene().coverage, strict=True):
+        assert (found.depth > 0)[covered].mean() > 0.75
+
+
+def test_points_lie_on_the_surface() -> None:
+    apart = errors_percent(matched())
+    assert len(apart) > 15_000
+    assert np.median(apart) < 0.12
+    assert np.quantile(apart, 0.95) < 0.5
+
+
+def test_normals_are_the_surface_s() -> None:
+    points = matched().points
+    cosine = (points.normals * true_normals(world_points(matched()))).sum(axis=1)
+    angles_deg = np.rad2deg(np.arccos(np.clip(cosine, -1, 1)))
+    assert np.median(angles_deg) < 6
+    assert np.quantile(angles_deg, 0.95) < 20
+    np.testing.assert_allclose(np.linalg.norm(points.normals, axis=1), 1, atol=1e-5)
+
+
+def test_colours_are_the_texture_s() -> None:
+    apart = np.abs(matched().points.colours_srgb - texture_srgb(world_points(matched())))
+    assert np.median(apart) < 0.03
+
+
+def test_points_are_their_depth_maps() -> None:
+    """Every point lies on its photograph's depth map, at that photograph's pixel."""
+    points, result = world_points(matched()), matched()
+    for index, (view, found) in enumerate(zip(scene().views, result.depth_maps, strict=True)):
+        mine = points[result.points.view_index == index]
+        in_camera = transform_points(view.camera.camera_from_world, mine)
+        at = np.floor((in_camera @ view.camera.intrinsics.T)[:, :2] / in_camera[:, 2:]).astype(int)
+        np.testing.assert_allclose(found.depth[at[:, 1], at[:, 0]] * OBJECT_UNIT, in_camera[:, 2], rtol=1e-4)
+
+
+def test_two_views_are_enough_and_are_trusted_less() -> None:
+    pair = match(photographed(arc_cameras(2, 15, 160)).views)
+    apart = errors_percent(pair)
+    assert len(apart) > 10_000
+    assert np.median(apart) < 0.15
+    assert np.quantile(apart, 0.95) < 0.6
+    assert set(pair.points.num_views) == {2}
+    assert pair.points.confidence.mean() < 0.8 * matched().points.confidence.mean()
+
+
+def test_confidence_tells_good_points_from_bad_ones() -> None:
+    confidence, apart = matched().points.confidence, errors_percent(matched())
+    assert confidence.min() >= 0
+    assert confidence.max() <= 1
+    sure = confidence > np.median(confidence)
+    assert apart[sure].mean() < 0.75 * apart[~sure].mean()
+
+
+# what must not matter
+
+
+def test_the_exposure_of_one_photograph_does_not_matter() -> None:
+    first, second, third = scene().views
+    brighter = replace(second, image_srgb=(second.image_srgb * 1.3 + 0.05).astype(np.float32))
+    changed = match((first, brighter, third))
+    for before, after in zip(matched().depth_maps, changed.depth_maps, strict=True):
+        both = (before.depth > 0) & (after.depth > 0)
+        assert both.sum() > 0.97 * (before.depth > 0).sum()
+        apart = 100 * np.abs(before.depth - after.depth)[both] * OBJECT_UNIT / diagonal()
+        assert np.quantile(apart, 0.95) < 0.05
+
+
+def test_the_noise_of_a_sensor_hardly_matters() -> None:
+    noisy = match(tuple(noise(view, seed) for seed, view in enumerate(scene().views)))
+    assert np.median(errors_percent(noisy)) < 0.15
+    assert len(noisy.points.positions) > 0.85 * len(matched().points.positions)
+
+
+def test_a_run_repeats_to_the_bit() -> None:
+    again = match(scene().views)
+    for field in ("positions", "normals", "colours_srgb", "confidence", "num_views", "view_index"):
+        np.testing.assert_array_equal(getattr(again.points, field), getattr(matched().points, field))
+    for first, second in zip(matched().depth_maps, again.depth_maps, strict=True):
+        np.testing.assert_array_equal(first.depth, second.depth)
+
+
+# what must not be measured
+
+
+def test_nothing_off_the_mask_is_kept() -> None:
+    """Masks of half the body: its other half has all the texture it needs, and must not come."""
+    halves = []
+    for view, covered in zip(scene().views, scene().coverage, strict=True):
+        left = covered & (np.arange(view.camera.width) < 80)
+        halves.append(replace(view, mask=left.astype(np.float32)))
+    result = match(tuple(halves))
+    for view, found in zip(halves, result.depth_maps, strict=True):
+        assert view.mask is not None
+        assert not found.depth[view.mask < 0.5].any()
+        assert (found.depth > 0).sum() > 0.5 * view.mask.sum()
+
+
+def test_points_lie_in_the_region() -> None:
+    """The wall behind is textured and seen by all, but far outside."""
+    views = photographed(arc_cameras(3, 30, 160), wall=True).without_masks().views
+    result = match(views)
+    assert np.linalg.norm(result.points.positions, axis=1).max() < 1
+    apart = errors_percent(result)
+    assert np.median(apart) < 0.12
+    assert np.quantile(apart, 0.95) < 0.8
+
+
+@pytest.mark.parametrize("noisy", [False, True])
+def test_a_masked_subject_without_texture_is_no_surface(noisy: bool) -> None:
+    views = photographed(arc_cameras(3, 30, 160), textured=False).views
+    if noisy:
+        views = tuple(noise(view, seed) for seed, view in enumerate(views))
+    with pytest.raises(ReconstructionError, match="agree on only") as raised:
+        match(views)
+    assert raised.value.code == ErrorCode.NO_SURFACE
+
+
+def test_photographs_of_nothing_are_no_surface() -> None:
+    """Even and noisy from side to side, without masks."""
+    views = []
+    for seed, view in enumerate(scene().without_masks().views):
+        even = np.full_like(view.image_srgb, 0.5)
+        views.append(noise(replace(view, image_srgb=even), seed))
+    with pytest.raises(ReconstructionError) as raised:
+        match(tuple(views))
+    assert raised.value.code == ErrorCode.NO_SURFACE
+
+
+def test_photographs_of_different_things_give_next_to_nothing() -> None:
+    """The same cameras; the photographs are mirrored and shifted, each otherwise."""
+    random = np.random.default_rng(3)
+    views = []
+    for view in scene().views:
+        rolled = np.roll(view.image_srgb, tuple(random.integers(30, 60, 2)), axis=(0, 1))
+        views.append(replace(view, image_srgb=np.ascontiguousarray(rolled[:, ::-1])))
+    try:
+        found = len(match(tuple(views)).points.positions)
+    except ReconstructionError:
+        found = 0
+    assert found < 0.1 * len(matched().points.positions)
+
+
+def test_an_outline_is_not_texture() -> None:
+    """An even subject before an even backdrop, no masks: whatever is measured must be right."""
+    views = photographed(arc_cameras(3, 30, 160), textured=False).without_masks().views
+    try:
+        apart = errors_percent(match(views))
+    except ReconstructionError:
+        return
+    assert np.median(apart) < 1
+
+
+def test_asking_for_more_agreement_gives_fewer_and_better_points() -> None:
+    strict = StereoConfig(min_correlation=0.95)
+    few = match_views(scene().views, true_region(), strict, device=torch.device("cpu"), progress=no_progress)
+    assert len(few.points.positions) < 0.9 * len(matched().points.positions)
+    assert np.quantile(errors_percent(few), 0.95) < np.quantile(errors_percent(matched()), 0.95)
+
+
+# words
+
+
+def test_progress_grows_and_may_cancel() -> None:
+    told: list[float] = []
+
+    def listen(fraction: float, _text: str) -> None:
+        told.append(fraction)
+        if len(told) == 2:
+            raise Cancelled
+
+    with pytest.raises(Cancelled):
+        match_views(scene().views, true_region(), StereoConfig(), device=torch.device("cpu"), progress=listen)
+    assert 0 <= told[0] < told[1] < 1
