@@ -9,6 +9,7 @@ from ..scene import Photo, Progress, SolvedCameras
 from .known_cameras import read_placement
 from .lenses import undistorted_view
 from .structure_from_motion import estimate_placement
+from .triangulation import triangulate
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,13 +56,16 @@ def solve_cameras(
     for number, placed in enumerate(placement.placed):
         progress(0.9 + 0.1 * number / len(placement.placed), "Removing lens distortion")
         views.append(undistorted_view(photos[placed.index], placed))
+    positions, visibility = placement.sparse_positions, placement.sparse_visibility
+    if not len(positions) and all(view.mask is None for view in views):
+        positions, visibility = triangulate(tuple(views), workdir=workdir, seed=seed, progress=progress)
     seen = {placed.index for placed in placement.placed}
     return SolvedCameras(
         views=tuple(views),
         unplaced=tuple(photo.name for index, photo in enumerate(photos) if index not in seen),
         estimated=given is None,
-        sparse_positions=placement.sparse_positions,
-        sparse_visibility=placement.sparse_visibility,
+        sparse_positions=positions,
+        sparse_visibility=visibility,
         reprojection_error_px=placement.reprojection_error_px,
         decisions=placement.decisions,
     )

@@ -57,6 +57,9 @@ def extract_mesh(
     vertices, faces = only_used(vertices, faces)
     progress(0.2, "simplifying")
     vertices, faces = simplified(vertices, faces, config.max_faces)
+    if 4 * len(faces) <= config.max_faces:
+        # room for more vertices is room for colour: photographs are finer than the grid
+        vertices, faces = trimesh.remesh.subdivide(vertices, faces)  # type: ignore[no-untyped-call]
     progress(0.4, "support and colour")
     points = transform_points(region.world_from_object, stereo.points.positions.astype(np.float64))
     cell = spacing(surface.distance.shape[0]) / np.cbrt(np.linalg.det(surface.grid_from_world[:3, :3]))

@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float64, Int64
 from scipy.ndimage import label
 
 from ..errors import ErrorCode, ReconstructionError
+from ..maths.raycast import in_picture
 from ..scene import Camera, Decision, Progress, Region, SolvedCameras, View
 
 
@@ -99,12 +100,16 @@ def _radius_in_frame(camera: Camera, centre: Float64[np.ndarray, "3"]) -> float:
 def _of_points(solved: SolvedCameras) -> tuple[Float64[np.ndarray, "3"], float]:
     """A sphere around the bulk of the points, each weighing as much as photographs see it.
 
-    Points far behind the subject are few and seen by few; the weighted median and a high quantile
-    of the distances leave them out.
+    The subject is what nearly all photographs have in their frames: what lies behind it for one camera is
+    behind or beside another. Of what is left, the weighted median and a high quantile of the distances
+    leave out the few that are far.
     """
     weight = solved.sparse_visibility.sum(axis=1).astype(np.float64) - 1
     weight = np.maximum(weight, 0.1)
     points = solved.sparse_positions
+    framed = np.mean([in_picture(points, view.camera) for view in solved.views], axis=0) > 0.8
+    if framed.sum() >= 20:
+        points, weight = points[framed], weight[framed]
     centre = np.array([weighted_quantile(points[:, axis], weight, 0.5) for axis in range(3)])
     for _ in range(3):
         distance = np.linalg.norm(points - centre, axis=1)

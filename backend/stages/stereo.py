@@ -61,7 +61,7 @@ class StereoConfig:
     max_points: int = 500_000
     """Points kept, evenly over all that are measured; depth maps keep every pixel."""
     noise: float = 1.2 / 255
-    """Standard deviation of sensor and coding noise in a flat patch."""
+    """Standard deviation of sensor and coding noise in a flat patch of a well exposed photograph."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -70,6 +70,8 @@ class DepthMap:
 
     depth: Float32[np.ndarray, "height width"]
     """Along the camera's axis, object units; 0 where nothing was measured."""
+    confidence: Float32[np.ndarray, "height width"]
+    """0 to 1."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -92,6 +94,7 @@ class _Window:
     grey: Float[Tensor, "height width"]
     """Free of its local mean."""
     patches: PatchStatistics
+    noise: float
     subject: Bool[Tensor, "height width"]
 
 
@@ -155,12 +158,15 @@ def _pyramid(view: View, region: Region, config: StereoConfig, device: torch.dev
     camera = camera.cropped(left, top, width, height)
     grey = image[top : top + height, left : left + width]
     subject = subject[top : top + height, left : left + width]
+    noise = config.noise * _exposure(grey)
     windows = []
     while True:
         flat = without_local_mean(grey, subject.float(), 2 * config.patch_radius)
         patches = patch_statistics(flat, subject.float(), config.patch_radius)
         windows.append(
-            _Window(left=left, top=top, camera=camera, grey=flat, patches=patches, subject=subject)
+            _Window(
+                noise=noise, left=left, top=top, camera=camera, grey=flat, patches=patches, subject=subject
+            )
         )
         if grey.numel() <= config.coarse_pixels or min(grey.shape) < 64:
             return windows
@@ -170,6 +176,12 @@ def _pyramid(view: View, region: Region, config: StereoConfig, device: torch.dev
         share = F.avg_pool2d(subject[None, : 2 * height, : 2 * width].float(), 2)[0]
         subject = share > 0
         camera = camera.cropped(0, 0, 2 * width, 2 * height).scaled(width, height)
+
+
+def _exposure(grey: Float[Tensor, "height width"]) -> float:
+    """1 for a well exposed photograph, less for a dark one, whose noise is darker too."""
+    bright = float(torch.quantile(grey.flatten()[:: max(1, grey.numel() // 100_000)], 0.99))
+    return min(max(bright / 0.5, 0.25), 1.0)
 
 
 def _sees_region(camera: Pinhole) -> Bool[Tensor, "height width"]:
@@ -295,7 +307,7 @@ def _scores(
         a, b = epipolar_map(source.camera, window.camera)
         where = warp_pixels(a, b, pixels, inverse_depth)
         warped = sample_image(source.grey[None], where)[:, 0]
-        score = correlation(window.patches, warped, config.noise)
+        score = correlation(window.patches, warped, max(window.noise, source.noise))
         seen = inside(where, source.camera.width, source.camera.height)
         per_source.append(torch.where(seen, score, -1.0))
     if len(per_source) == 1:
@@ -409,8 +421,7 @@ def _points(views: tuple[View, ...], maps: list[_Map], kept: list[Tensor], max_p
         positions = unproject(camera, pixels, 1 / map_.inverse_depth.clamp(min=1e-6))
         direction = F.normalize(camera.position - positions, dim=-1)
         facing = (normals * direction).sum(dim=-1).clamp(min=0)
-        # two views that agree weigh half as much as many; grazing views measure worse
-        confidence = map_.score.clamp(0, 1) * (1 - torch.exp(-0.7 * (votes - 1))) * facing.sqrt()
+        confidence = _confidence(map_, votes) * facing.sqrt()  # grazing views measure worse
         image = torch.tensor(view.image_srgb, device=votes.device).permute(2, 0, 1)
         corner = pixels.new_tensor([map_.window.left, map_.window.top])
         colours = sample_image(image, (pixels + corner)[None])[0].permute(1, 2, 0)
@@ -430,6 +441,12 @@ def _points(views: tuple[View, ...], maps: list[_Map], kept: list[Tensor], max_p
     )
 
 
+def _confidence(map_: _Map, votes: Float[Tensor, "height width"]) -> Float[Tensor, "height width"]:
+    """Agreement of the patches; where only two views agree, half as much as where many do."""
+    confidence: Float[Tensor, "height width"] = map_.score.clamp(0, 1) * -torch.expm1(-0.7 * (votes - 1))
+    return confidence
+
+
 def _every(stride: int, mask: Bool[Tensor, "height width"]) -> Bool[Tensor, "height width"]:
     """One in `stride` of the pixels that are set, spread over rows and columns alike."""
     number = mask.flatten().cumsum(0).reshape(mask.shape)
@@ -442,5 +459,7 @@ def _full_size(view: View, map_: _Map, votes: Float[Tensor, "height width"]) -> 
     depth = np.zeros((view.camera.height, view.camera.width), np.float32)
     height, width = votes.shape
     part = np.s_[map_.window.top : map_.window.top + height, map_.window.left : map_.window.left + width]
+    confidence = np.zeros_like(depth)
     depth[part] = torch.where(measured, 1 / map_.inverse_depth.clamp(min=1e-6), 0.0).cpu().numpy()
-    return DepthMap(depth=depth)
+    confidence[part] = torch.where(measured, _confidence(map_, votes), 0.0).cpu().numpy()
+    return DepthMap(depth=depth, confidence=confidence)

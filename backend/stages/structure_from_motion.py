@@ -91,11 +91,11 @@ def estimate_placement(
     database = workdir / "features.db"
     folder.mkdir(parents=True, exist_ok=True)
     database.unlink(missing_ok=True)
-    sizes = [_write_picture(photo, folder / _picture_name(i), max_side_px) for i, photo in enumerate(photos)]
+    sizes = [_write_picture(photo, folder / picture_name(i), max_side_px) for i, photo in enumerate(photos)]
     num_features = min(max_features, max(_FEWEST_FEATURES, _FEATURE_BUDGET // len(photos)))
     groups = _lens_groups(photos, sizes)
-    _register_pictures(database, folder, groups)
-    _extract_features(database, folder, groups, num_features, progress)
+    register_pictures(database, folder, groups)
+    extract_features(database, folder, groups, num_features, progress)
     model = _best_model(database, folder, workdir, len(photos), seed, progress)
     if model is None or model.num_reg_images() < 2:
         raise why_none_placed(database, len(photos))
@@ -106,7 +106,7 @@ def estimate_placement(
 
 
 @dataclass(frozen=True, kw_only=True)
-class _LensGroup:
+class LensGroup:
     """Photographs that share one lens."""
 
     names: tuple[str, ...]
@@ -115,7 +115,7 @@ class _LensGroup:
     focal_px: float | None
 
 
-def _picture_name(index: int) -> str:
+def picture_name(index: int) -> str:
     return f"{index:04d}.png"
 
 
@@ -131,11 +131,11 @@ def _write_picture(photo: Photo, path: Path, max_side_px: int) -> tuple[int, int
         image = read_image(photo.path, max_side_px).image_srgb
     elif image.shape[1] > width:
         image = resized(image, width, height)
-    PIL.Image.fromarray(_grey(image)).save(path, compress_level=1)
+    PIL.Image.fromarray(brightness(image)).save(path, compress_level=1)
     return image.shape[1], image.shape[0]
 
 
-def _grey(image_srgb: Float32[np.ndarray, "height width 3"]) -> UInt8[np.ndarray, "height width"]:
+def brightness(image_srgb: Float32[np.ndarray, "height width 3"]) -> UInt8[np.ndarray, "height width"]:
     """Brightness, of a dark photograph raised: features are found by absolute contrast."""
     luma = image_srgb @ np.array([0.299, 0.587, 0.114], np.float32)  # ITU-R BT.601
     level = float(np.quantile(luma, _BRIGHT_SHARE))
@@ -144,7 +144,7 @@ def _grey(image_srgb: Float32[np.ndarray, "height width 3"]) -> UInt8[np.ndarray
     return grey
 
 
-def _lens_groups(photos: Sequence[Photo], sizes: Sequence[tuple[int, int]]) -> list[_LensGroup]:
+def _lens_groups(photos: Sequence[Photo], sizes: Sequence[tuple[int, int]]) -> list[LensGroup]:
     """One group for each picture size and focal length: the same camera, not zoomed in between."""
     members: dict[tuple[int, int, float | None], list[str]] = {}
     for index, (photo, (width, height)) in enumerate(zip(photos, sizes, strict=True)):
@@ -153,9 +153,9 @@ def _lens_groups(photos: Sequence[Photo], sizes: Sequence[tuple[int, int]]) -> l
             focal_px = round(
                 photo.focal_px * max(width, height) / max(photo.original_width, photo.original_height), 1
             )
-        members.setdefault((width, height, focal_px), []).append(_picture_name(index))
+        members.setdefault((width, height, focal_px), []).append(picture_name(index))
     return [
-        _LensGroup(names=tuple(names), width=width, height=height, focal_px=focal_px)
+        LensGroup(names=tuple(names), width=width, height=height, focal_px=focal_px)
         for (width, height, focal_px), names in members.items()
     ]
 
@@ -164,7 +164,7 @@ def _num_threads() -> int:
     return max(1, min(_MOST_THREADS, os.cpu_count() or 1))
 
 
-def _register_pictures(database: Path, folder: Path, groups: Sequence[_LensGroup]) -> None:
+def register_pictures(database: Path, folder: Path, groups: Sequence[LensGroup]) -> None:
     """Enter pictures and lenses in order: the threads that extract would number them as they finish."""
     pycolmap.Database.open(database).close()
     for group in groups:
@@ -182,8 +182,8 @@ def _register_pictures(database: Path, folder: Path, groups: Sequence[_LensGroup
         )
 
 
-def _extract_features(
-    database: Path, folder: Path, groups: Sequence[_LensGroup], num_features: int, progress: Progress
+def extract_features(
+    database: Path, folder: Path, groups: Sequence[LensGroup], num_features: int, progress: Progress
 ) -> None:
     options = pycolmap.FeatureExtractionOptions()
     options.use_gpu = False
@@ -203,7 +203,7 @@ def _extract_features(
         )
 
 
-def _match(database: Path, guided: bool, seed: int) -> None:
+def match_pictures(database: Path, guided: bool, seed: int) -> None:
     with pycolmap.Database.open(database) as opened:
         opened.clear_matches()
         opened.clear_two_view_geometries()
@@ -234,7 +234,7 @@ def _best_model(
             break
         if attempt.guided != matched_guided:
             progress(0.5 + 0.1 * number, "Matching photographs")
-            _match(database, attempt.guided, seed)
+            match_pictures(database, attempt.guided, seed)
             matched_guided = attempt.guided
         on_photo = partial(progress, 0.6 + 0.1 * number, "Placing cameras")
         for model in _mapped(database, folder, workdir, attempt, seed, on_photo):

@@ -33,6 +33,8 @@ COARSEST = 48
 """Nodes along each axis of the grid that finds the surface's extent."""
 ROUNDS = 5
 """How often the linear fit asks anew which inequalities are broken."""
+SURE = 0.4
+"""Confidence of a depth that carves: two photographs that agree to 0.8, or three to 0.53."""
 PRIOR = 1e-3
 """Weight of the level before, at 32 nodes, beside measurements of about 1."""
 LEAST_RADIUS = 0.3
@@ -176,7 +178,7 @@ def _scene(
         backdrops=[_backdrop(v, i, m) for v, i, m in zip(views, images, stereo.depth_maps, strict=True)],
         masks=[None if v.mask is None else torch.tensor(v.mask, device=device) for v in views],
         outlines=[None if v.mask is None else torch.tensor(_outline(v.mask), device=device) for v in views],
-        depths=[torch.tensor(map_.depth * scale, device=device) for map_ in stereo.depth_maps],
+        depths=[_sure_depth(map_, scale, device) for map_ in stereo.depth_maps],
         positions=torch.tensor(points.positions, device=device) * scale + middle,
         normals=torch.tensor(points.normals, device=device),
         colours=torch.tensor(points.colours_srgb, device=device),
@@ -184,6 +186,11 @@ def _scene(
         region_centre=middle,
         region_radius=scale,
     )
+
+
+def _sure_depth(map_: DepthMap, scale: float, device: torch.device) -> Float[Tensor, "height width"]:
+    """Depths sure enough to call what lies before them empty; 0 elsewhere."""
+    return torch.tensor(np.where(map_.confidence > SURE, map_.depth * scale, 0), device=device)
 
 
 def _backdrop(view: View, image: Tensor, map_: DepthMap) -> Float[Tensor, "height width"] | None:
