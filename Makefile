@@ -11,6 +11,7 @@ help:
 	@echo "make demo    render 6 views of a scene, reconstruct it, measure the error"
 	@echo "make test    run all tests"
 	@echo "make check   style and types"
+	@echo "make benchmark   speed against error, as a table"
 
 demo: .venv/.ready $(DEMO)/scene/transforms.json
 	$(BACKEND) -m backend reconstruct $(DEMO)/scene/images --cameras $(DEMO)/scene/transforms.json \
@@ -30,8 +31,19 @@ check: .venv/.ready
 	$(BACKEND) -m ruff format --check
 	$(BACKEND) -m mypy
 
-benchmark: .venv/.ready
-	$(BACKEND) -m backend benchmark quick --output build/benchmark
+BENCHMARK := build/benchmark
+SCENES := $(addprefix $(BENCHMARK)/scenes/,monkey_3 monkey_6 plaster_6)
+PHOTOS ?= $(wildcard ../shared/data)
+
+benchmark: .venv/.ready $(addsuffix /transforms.json,$(SCENES))
+	$(BACKEND) benchmarks/measure.py --scenes $(BENCHMARK)/scenes --output $(BENCHMARK) \
+	    $(if $(PHOTOS),--photos $(PHOTOS))
+
+# A scene's folder is its name and its number of views: three are taken over 40 degrees, six over 120.
+$(BENCHMARK)/scenes/%/transforms.json: .venv-blender/.ready $(wildcard blender_scenes/*.py)
+	$(BLENDER) -m blender_scenes.render_views --scene $(firstword $(subst _, ,$*)) \
+	    --views $(lastword $(subst _, ,$*)) --layout arc \
+	    --arc-deg $(if $(filter 3,$(lastword $(subst _, ,$*))),40,120) --output $(@D)
 
 .venv/.ready: pyproject.toml constraints.txt
 	$(PYTHON) -m venv .venv

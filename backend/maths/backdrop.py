@@ -11,8 +11,9 @@ def empty_backdrop(
 ) -> Bool[Tensor, "height width"] | None:
     """Pixels that show nothing but the backdrop; None where the photograph has no such backdrop.
 
-    A backdrop is there if more than half of the picture's border has one colour, to within a few grey
-    levels. Pixels of that colour count if they belong to a 7x7 square of it: specks do not.
+    A backdrop is there if half of the picture's border has one colour, to within a few grey levels: its
+    median distance from the median colour says so. Pixels of that colour count if they belong to a 7x7
+    square of it: specks do not.
     """
     border = torch.cat(
         [image_srgb[:, 0], image_srgb[:, -1], image_srgb[:, :, 0], image_srgb[:, :, -1]], dim=1
@@ -20,10 +21,10 @@ def empty_backdrop(
     colour = border.median(dim=1).values
     apart = (border - colour[:, None]).abs().amax(dim=0)
     tolerance = max(3 * float(apart.median()), 4 / 255)
-    if tolerance > 0.05 or float((apart < tolerance).float().mean()) < 0.5:
+    if tolerance > 0.05:
         return None
     alike = (image_srgb - colour[:, None, None]).abs().amax(dim=0) < tolerance
-    return _grown(~_grown(~alike, 3), 3) & alike
+    return _grown(~_grown(~alike, 3), 3)
 
 
 def _grown(pixels: Bool[Tensor, "height width"], radius: int) -> Bool[Tensor, "height width"]:

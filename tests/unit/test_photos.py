@@ -8,7 +8,7 @@ from PIL import ExifTags, Image
 
 from backend.errors import Cancelled, ErrorCode, ReconstructionError
 from backend.scene import Photo, no_progress
-from backend.stages.photos import PhotosConfig, load_photos, match_masks, natural_order
+from backend.stages.photos import PhotosConfig, is_outline, load_photos, match_masks, natural_order
 
 CONFIG = PhotosConfig(max_side_px=100)
 
@@ -151,3 +151,12 @@ def test_progress_can_cancel(tmp_path: Path) -> None:
 
     with pytest.raises(Cancelled):
         load_photos([tmp_path], None, CONFIG, progress=cancel)
+
+
+def test_an_alpha_that_is_opaque_along_the_edges_is_no_outline() -> None:
+    subject = np.zeros((60, 80), np.float32)
+    subject[20:40, 30:50] = 1
+    valid = np.ones((60, 80), np.float32)
+    valid[:2], valid[:, -1] = 0, 0  # what undistortion leaves
+    assert is_outline(subject)
+    assert not is_outline(valid)

@@ -147,6 +147,20 @@ def test_a_background_that_two_views_see_yields_to_a_subject_that_all_see() -> N
     assert region.radius_world < 1.6 * REACH
 
 
+def test_what_stands_behind_the_subject_for_one_camera_is_left_out() -> None:
+    """A wall behind the subject, seen by two cameras of a ring, with more points than the subject has."""
+    cameras = ring_cameras(6, 160)
+    rng = np.random.default_rng(3)
+    away = -cameras[0].position / np.linalg.norm(cameras[0].position)
+    wall = cameras[0].position * -3 + rng.normal(size=(3000, 3)) * 0.3 + away
+    subject = surface_samples(800)
+    alone, both = (
+        region_of(without_images(cameras, **sparse(p))) for p in (subject, np.vstack([subject, wall]))
+    )
+    np.testing.assert_allclose(both.centre_world, alone.centre_world, atol=0.02 * alone.radius_world)
+    assert both.radius_world == pytest.approx(alone.radius_world, rel=0.02)
+
+
 def sparse(points: np.ndarray) -> dict[str, np.ndarray]:
     return {"sparse_positions": points, "sparse_visibility": np.ones((len(points), 3), bool)}
 
