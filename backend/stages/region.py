@@ -14,6 +14,9 @@ from ..errors import ErrorCode, ReconstructionError
 from ..maths.raycast import in_picture
 from ..scene import Camera, Decision, Progress, Region, SolvedCameras, View
 
+FEATURES_REACH = 1.1
+"""The surface goes on where features end."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class RegionConfig:
@@ -45,7 +48,8 @@ def find_region(solved: SolvedCameras, config: RegionConfig, *, progress: Progre
     if len(solved.sparse_positions) >= 20:
         centre, radius = _of_points(solved)
         because = f"no masks, but {len(solved.sparse_positions)} triangulated points"
-        return _region(centre, radius * config.margin, "where the photographs overlap", because)
+        radius *= FEATURES_REACH * config.margin
+        return _region(centre, radius, "where the photographs overlap", because)
     centre, radius = _of_cameras([view.camera for view in solved.views])
     return _region(centre, radius, "what all cameras look at", "neither masks nor triangulated points")
 

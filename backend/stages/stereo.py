@@ -17,7 +17,7 @@ from jaxtyping import Bool, Float, Float32
 from torch import Tensor
 
 from ..errors import ErrorCode, ReconstructionError
-from ..maths.backdrop import empty_backdrop
+from ..maths.backdrop import find_backdrop
 from ..maths.correlation import (
     PatchStatistics,
     correlation,
@@ -72,6 +72,10 @@ class DepthMap:
     """Along the camera's axis, object units; 0 where nothing was measured."""
     confidence: Float32[np.ndarray, "height width"]
     """0 to 1."""
+    empty: Bool[np.ndarray, "height width"] | None
+    """Where the photograph, if it has no mask, shows nothing but an even backdrop; None where it has none."""
+    subject: Bool[np.ndarray, "height width"] | None
+    """Where something surely stands before that backdrop."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -126,7 +130,7 @@ def match_views(
         points = _points(views, maps, kept, config.max_points)
     _check_enough(points)
     depth_maps = tuple(
-        _full_size(view, map_, agreed) for view, map_, agreed in zip(views, maps, kept, strict=True)
+        _full_size(view, map_, agreed, region) for view, map_, agreed in zip(views, maps, kept, strict=True)
     )
     return StereoResult(points=points, depth_maps=depth_maps)
 
@@ -152,8 +156,8 @@ def _pyramid(view: View, region: Region, config: StereoConfig, device: torch.dev
     subject = _sees_region(camera)
     if view.mask is not None:
         subject &= torch.tensor(view.mask > 0.5, device=device)
-    elif (empty := empty_backdrop(colours)) is not None:
-        subject &= ~empty
+    elif (backdrop := find_backdrop(colours, subject)) is not None:
+        subject &= ~backdrop.empty
     left, top, width, height = _bounding_box(subject)
     camera = camera.cropped(left, top, width, height)
     grey = image[top : top + height, left : left + width]
@@ -453,8 +457,12 @@ def _every(stride: int, mask: Bool[Tensor, "height width"]) -> Bool[Tensor, "hei
     return mask & (number * 7919 % stride == 0)
 
 
-def _full_size(view: View, map_: _Map, votes: Float[Tensor, "height width"]) -> DepthMap:
+def _full_size(view: View, map_: _Map, votes: Float[Tensor, "height width"], region: Region) -> DepthMap:
     """The window's measurements over the whole photograph."""
+    backdrop = None
+    if view.mask is None:
+        colours = torch.tensor(view.image_srgb, device=votes.device).permute(2, 0, 1)
+        backdrop = find_backdrop(colours, _sees_region(pinhole_in_object(view.camera, region, votes.device)))
     measured = votes > 0
     depth = np.zeros((view.camera.height, view.camera.width), np.float32)
     height, width = votes.shape
@@ -462,4 +470,10 @@ def _full_size(view: View, map_: _Map, votes: Float[Tensor, "height width"]) -> 
     confidence = np.zeros_like(depth)
     depth[part] = torch.where(measured, 1 / map_.inverse_depth.clamp(min=1e-6), 0.0).cpu().numpy()
     confidence[part] = torch.where(measured, _confidence(map_, votes), 0.0).cpu().numpy()
-    return DepthMap(depth=depth, confidence=confidence)
+    return DepthMap(
+        depth=depth,
+        confidence=confidence,
+        # a shadow may be as dark as the backdrop: what was measured is not empty
+        empty=None if backdrop is None else backdrop.empty.cpu().numpy() & (depth == 0),
+        subject=None if backdrop is None else backdrop.subject.cpu().numpy(),
+    )

@@ -12,13 +12,12 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 import torch.nn.functional as F
-from jaxtyping import Bool, Float, Float32, Float64, Int
+from jaxtyping import Bool, Float, Float32, Float64, Int, Shaped
 from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 
 from ..errors import ErrorCode, ReconstructionError
 from ..maths import losses
-from ..maths.backdrop import empty_backdrop
 from ..maths.evidence import off_silhouette, point_distances, seen_through
 from ..maths.geometry import Pinhole, pinhole_in_object, project, ray_directions
 from ..maths.grid import Corners, laplacian_at, locate, node_positions, read, refined, spacing, splat
@@ -35,6 +34,8 @@ ROUNDS = 5
 """How often the linear fit asks anew which inequalities are broken."""
 SURE = 0.4
 """Confidence of a depth that carves: two photographs that agree to 0.8, or three to 0.53."""
+CARVE = 4.0
+"""Weight of free space where the field breaks it, beside measurements of about 1."""
 PRIOR = 1e-3
 """Weight of the level before, at 32 nodes, beside measurements of about 1."""
 LEAST_RADIUS = 0.3
@@ -80,6 +81,8 @@ class _Scene:
     """Signed distance to the mask's outline in pixels, > 0 off the subject."""
     backdrops: list[Float[Tensor, "height width"] | None]
     """The same for an empty backdrop where there is no mask: > 0 on it; what is not on it may be anything."""
+    certain: list[Float[Tensor, "height width"] | None]
+    """The same, < 0 where the subject surely is."""
     depths: list[Float[Tensor, "height width"]]
     positions: Float[Tensor, "points 3"]
     normals: Float[Tensor, "points 3"]
@@ -141,8 +144,8 @@ def _decisions(scene: _Scene, frame: Region, config: TrainConfig) -> tuple[Decis
         ),
         Decision(
             what="silhouettes",
-            choice="used on both sides" if masks else ("carve only" if backdrops else "left out"),
-            because=f"{masks} photographs have masks, {backdrops} an empty backdrop",
+            choice="used" if masks or backdrops else "left out",
+            because=f"{masks} photographs have masks, {backdrops} an even backdrop",
         ),
         Decision(
             what="depth of the unseen side",
@@ -172,12 +175,16 @@ def _scene(
     scale = region.radius_world / frame.radius_world
     middle = torch.tensor(frame_from_object[:3, 3], dtype=torch.float32, device=device)
     images = [torch.tensor(view.image_srgb, device=device).permute(2, 0, 1) for view in views]
+    outlines = [_outline_or_none(view.mask, device) for view in views]
+    empty = [None if m.empty is None else ~m.empty for m in stereo.depth_maps]
+    subject = [_outline_or_none(m.subject, device) for m in stereo.depth_maps]
     return _Scene(
         cameras=[pinhole_in_object(view.camera, frame, device) for view in views],
         images=images,
-        backdrops=[_backdrop(v, i, m) for v, i, m in zip(views, images, stereo.depth_maps, strict=True)],
+        backdrops=[_outline_or_none(known, device) for known in empty],
+        certain=[on if o is None else o for o, on in zip(outlines, subject, strict=True)],
         masks=[None if v.mask is None else torch.tensor(v.mask, device=device) for v in views],
-        outlines=[None if v.mask is None else torch.tensor(_outline(v.mask), device=device) for v in views],
+        outlines=outlines,
         depths=[_sure_depth(map_, scale, device) for map_ in stereo.depth_maps],
         positions=torch.tensor(points.positions, device=device) * scale + middle,
         normals=torch.tensor(points.normals, device=device),
@@ -191,17 +198,6 @@ def _scene(
 def _sure_depth(map_: DepthMap, scale: float, device: torch.device) -> Float[Tensor, "height width"]:
     """Depths sure enough to call what lies before them empty; 0 elsewhere."""
     return torch.tensor(np.where(map_.confidence > SURE, map_.depth * scale, 0), device=device)
-
-
-def _backdrop(view: View, image: Tensor, map_: DepthMap) -> Float[Tensor, "height width"] | None:
-    if view.mask is not None:
-        return None
-    empty = empty_backdrop(image)
-    if empty is None:
-        return None
-    # a shadow may be as dark as the backdrop: what stereo measured is not empty
-    empty &= torch.tensor(map_.depth == 0, device=image.device)
-    return torch.tensor(_outline(1 - empty.cpu().numpy().astype(np.float32)), device=image.device)
 
 
 def _tight_frame(distance: Float[Tensor, "nodes nodes nodes"], region: Region) -> Region:
@@ -222,6 +218,12 @@ def _tight_frame(distance: Float[Tensor, "nodes nodes nodes"], region: Region) -
     frame_from_object[:3, :3] /= half
     frame_from_object[:3, 3] = -((low + high) / 2).cpu().double().numpy() / half
     return Region(object_from_world=frame_from_object @ region.object_from_world)
+
+
+def _outline_or_none(
+    mask: Shaped[np.ndarray, "height width"] | None, device: torch.device
+) -> Float[Tensor, "height width"] | None:
+    return None if mask is None else torch.tensor(_outline(mask.astype(np.float32)), device=device)
 
 
 def _outline(mask: Float32[np.ndarray, "height width"]) -> Float32[np.ndarray, "height width"]:
@@ -297,7 +299,7 @@ def _fit_level(
     for _ in range(ROUNDS):
         target, weight = before.clone(), torch.full_like(before, PRIOR * (32 / nodes) ** 2)
         carved = distance < outside
-        target[carved], weight[carved] = outside[carved], 0.5
+        target[carved], weight[carved] = outside[carved], CARVE
         carved = through & (distance < 2 * h)
         target[carved], weight[carved] = 2 * h, 0.2
         missed += splat(*_missed_silhouettes(scene, distance), nodes)
@@ -316,13 +318,14 @@ def _missed_silhouettes(
     """Rays through masks that miss the field's inside: ones, and the places where they come nearest to it."""
     nodes = distance.shape[0]
     places = []
-    for camera, outline in zip(scene.cameras, scene.outlines, strict=True):
+    for camera, outline in zip(scene.cameras, scene.certain, strict=True):
         if outline is None:
             continue
         step = max(1, round(float(spacing(nodes) * camera.intrinsics[0, 0] / camera.position.norm()) / 2))
         rows, columns = torch.nonzero(outline[::step, ::step] < -0.5 * step, as_tuple=True)
         pixels = torch.stack([columns, rows], dim=-1) * step + 0.5
         directions = F.normalize(ray_directions(camera, pixels), dim=-1)
+        directions = directions[_meets_region(scene, camera, directions)]
         origins = camera.position.expand_as(directions)
         crossing = first_crossing(
             lambda x: read(distance, x),
@@ -337,6 +340,17 @@ def _missed_silhouettes(
         places.append((origins + crossing.along[:, None] * directions)[missed])
     points = torch.cat(places) if places else scene.positions[:0]
     return torch.ones_like(points[:, :1]), locate(points, nodes)
+
+
+def _meets_region(
+    scene: _Scene, camera: Pinhole, directions: Float[Tensor, "rays 3"]
+) -> Bool[Tensor, "rays"]:
+    """Rays that go through the region's inner nine tenths."""
+    apart = scene.region_centre - camera.position
+    along = directions @ apart
+    closest = (apart - along[:, None] * directions).norm(dim=-1)
+    meets: Bool[Tensor, "rays"] = (closest < 0.9 * scene.region_radius) & (along > 0)
+    return meets
 
 
 def _free_distance(scene: _Scene, nodes: int) -> Float[Tensor, "nodes nodes nodes"]:
