@@ -60,7 +60,11 @@ def photo_cases(folder: Path) -> list[Case]:
     reference = ("--truth", str(folder / walnut / "reference.ply"))
     found = [
         (dtu, "statuette, 3, masks", known(dtu, files(dtu, "image/*.png", 0, 3), *masks)),
-        (temple, "temple, 5", known(temple, files(temple, "images/*.png", 5, 10))),
+        (
+            temple,
+            "temple, 6",
+            known(temple, (*files(temple, "images/*.png", 5, 10), *files(temple, "images/*.png", 0, 1))),
+        ),
         (walnut, "walnut, 6", known(walnut, files(walnut, "images/*.png", 0, 6), *reference)),
         (fountain, "fountain, 3, cameras unknown", files(fountain, "images/*.jpg", 3, 6)),
         (fountain, "fountain, 11, cameras unknown", files(fountain, "images/*.jpg", 0, 11)),

@@ -235,8 +235,10 @@ def vertex_colours(
         mine = np.flatnonzero(seen[:, column])
         towards = view.camera.position - vertices[mine]
         facing = (towards * normals[mine]).sum(axis=1) / np.linalg.norm(towards, axis=1)
-        share = np.clip(facing, 1e-3, 1) ** 4
-        total[mine] += share[:, None] * _colours_at(view, vertices[mine])
+        sampled = _colours_at(view, vertices[mine])
+        # a pixel half off the subject has half the backdrop's colour: the fourth power leaves it out
+        share = (np.clip(facing, 1e-3, 1) * sampled[:, 3]) ** 4
+        total[mine] += share[:, None] * sampled[:, :3]
         weight[mine] += share
     known = weight > 0
     colours = total / np.where(known, weight, 1.0)[:, None]
@@ -248,15 +250,20 @@ def vertex_colours(
     return np.clip(colours * 255 + 0.5, 0, 255).astype(np.uint8)
 
 
-def _colours_at(view: View, points: Vertices) -> Float64[np.ndarray, "points 3"]:
-    """Bilinear colours of the photograph where it shows the points; they must lie in front of it."""
+def _colours_at(view: View, points: Vertices) -> Float64[np.ndarray, "points 4"]:
+    """Bilinear colours and mask of the photograph where it shows the points, which lie in front of it."""
     homogeneous = transform_points(view.camera.camera_from_world, points) @ view.camera.intrinsics.T
     pixel = homogeneous[:, :2] / homogeneous[:, 2:] - 0.5
     limit = np.array([view.camera.width - 1, view.camera.height - 1])
     low = np.clip(np.floor(pixel), 0, np.maximum(limit - 1, 0)).astype(int)
     t = np.clip(pixel - low, 0, 1)
     (x, y), (s, u) = low.T, t.T[..., None]
-    image, right, down = view.image_srgb, np.minimum(x + 1, limit[0]), np.minimum(y + 1, limit[1])
+    mask = np.ones(view.image_srgb.shape[:2], np.float32) if view.mask is None else view.mask
+    image, right, down = (
+        np.dstack([view.image_srgb, mask]),
+        np.minimum(x + 1, limit[0]),
+        np.minimum(y + 1, limit[1]),
+    )
     upper = image[y, x] * (1 - s) + image[y, right] * s
     lower = image[down, x] * (1 - s) + image[down, right] * s
     return np.asarray(upper * (1 - u) + lower * u, np.float64)

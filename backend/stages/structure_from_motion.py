@@ -166,6 +166,7 @@ def _num_threads() -> int:
 
 def register_pictures(database: Path, folder: Path, groups: Sequence[LensGroup]) -> None:
     """Enter pictures and lenses in order: the threads that extract would number them as they finish."""
+    pycolmap.logging.minloglevel = pycolmap.logging.FATAL.value  # its notes go to the user's terminal
     pycolmap.Database.open(database).close()
     for group in groups:
         reader = pycolmap.ImageReaderOptions()
