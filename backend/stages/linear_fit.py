@@ -1,0 +1,160 @@
+"""The linear part of the fit: the smoothest field that agrees with points, silhouettes and free space."""
+
+import math
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from ..maths.evidence import off_silhouette, point_distances, seen_through
+from ..maths.geometry import Pinhole, project, ray_directions
+from ..maths.grid import Corners, locate, node_positions, read, spacing, splat
+from ..maths.rays import first_crossing, sphere_entry
+from ..maths.smooth_fit import fit_smooth
+from .measurements import Measurements
+
+ROUNDS = 5
+"""How often the fit asks anew which inequalities are broken."""
+CARVE = 4.0
+"""Weight of free space where the field breaks it, beside measurements of about 1."""
+PRIOR = 1e-3
+"""Weight of the level before, at 32 nodes, beside measurements of about 1."""
+LEAST_RADIUS = 0.3
+"""Of the ball behind the surface, in half widths of the subject."""
+
+
+def start(scene: Measurements, nodes: int) -> Float[Tensor, "nodes nodes nodes"]:
+    """A field to begin with: the ball behind the surface, cut by what is free."""
+    return torch.maximum(_ball_behind(scene, nodes), _free_distance(scene, nodes))
+
+
+def _ball_behind(scene: Measurements, nodes: int) -> Float[Tensor, "nodes nodes nodes"]:
+    """All that is known of backs: (|x - c|^2 - r^2) / 2r of the ball that explains the measured points.
+
+    Least squares of p = c + r n over points and normals: for points all around it is the object's size,
+    for points on one side what the turning of their normals says. Where the photographs are taken from
+    sides far enough apart for silhouettes to bound the depth, it is as large as the subject is wide.
+    """
+    weight = (scene.confidence / scene.confidence.sum())[:, None]
+    mean_p, mean_n = (weight * scene.positions).sum(dim=0), (weight * scene.normals).sum(dim=0)
+    spread = (weight * (scene.normals - mean_n).square()).sum()
+    together = (weight * (scene.positions - mean_p) * (scene.normals - mean_n)).sum()
+    widest = _half_width(scene, mean_p)
+    explained = float((together / spread.clamp(min=1e-6)).clamp(LEAST_RADIUS * widest, widest))
+    bounded = min(max((widest_angle_deg(scene) - 50) / 40, 0.0), 1.0)
+    radius = explained + bounded * (widest - explained)
+    apart = node_positions(nodes, scene.positions.device) - (mean_p - radius * mean_n)
+    return (apart.square().sum(dim=-1) - radius * radius) / (2 * radius)
+
+
+def widest_angle_deg(scene: Measurements) -> float:
+    """Largest angle between two cameras, seen from the region's middle."""
+    directions = F.normalize(torch.stack([c.position for c in scene.cameras]) - scene.region_centre, dim=-1)
+    return math.degrees(math.acos(float((directions @ directions.T).min().clamp(-1, 1))))
+
+
+def _half_width(scene: Measurements, at: Float[Tensor, "3"]) -> float:
+    """Largest half extent of the subject across the views, at the distance of a point of it."""
+    widths = []
+    for camera, outline in zip(scene.cameras, scene.outlines, strict=True):
+        if outline is not None:
+            rows, columns = torch.nonzero(outline < 0, as_tuple=True)
+            middle_r, middle_c = (rows.max() + rows.min()) / 2, (columns.max() + columns.min()) / 2
+            reach_px = torch.hypot(rows - middle_r, columns - middle_c).max()
+            depth = project(camera, at)[1]
+            widths.append(float(reach_px * depth / camera.intrinsics[0, 0]))
+    return max(widths) if widths else 0.6 * scene.region_radius
+
+
+def fit_level(
+    scene: Measurements, before: Float[Tensor, "nodes nodes nodes"], smoothness: float
+) -> Float[Tensor, "nodes nodes nodes"]:
+    """The smoothest field near the points' planes that silhouettes allow, else like the level before.
+
+    Smooth is measured against a ball, whose curvature is free. Free space (f > 0) and silhouettes
+    (f < 0 somewhere on each ray) are inequalities: they pull only where the field says otherwise, which
+    takes a few rounds.
+    """
+    nodes = before.shape[0]
+    h = spacing(nodes)
+    measured = point_distances(scene.positions, scene.normals, scene.confidence**3, nodes)
+    measured_weight = measured.weight.clamp(max=4.0)
+    ball = _ball_behind(scene, nodes)
+    outside = _free_distance(scene, nodes)
+    through = _seen_through_any(scene, nodes, 3 * h)
+    missed = torch.zeros((nodes**3, 1), device=before.device)
+    distance = before
+    for _ in range(ROUNDS):
+        target, weight = before.clone(), torch.full_like(before, PRIOR * (32 / nodes) ** 2)
+        carved = distance < outside
+        target[carved], weight[carved] = outside[carved], CARVE
+        carved = through & (distance < 2 * h)
+        target[carved], weight[carved] = 2 * h, 0.2
+        missed += splat(*_missed_silhouettes(scene, distance), nodes)
+        pull = 0.2 * missed.reshape(distance.shape).clamp(max=1.0) * (outside < 0)
+        total = weight + measured_weight + pull
+        target = (weight * target + measured_weight * measured.distance - pull * h) / total
+        distance = ball + fit_smooth(target - ball, total, distance - ball, smoothness=smoothness, steps=30)
+    return distance
+
+
+def _missed_silhouettes(
+    scene: Measurements, distance: Float[Tensor, "nodes nodes nodes"]
+) -> tuple[Float[Tensor, "rays 1"], Corners]:
+    """Rays through masks that miss the field's inside: ones, and the places where they come nearest to it."""
+    nodes = distance.shape[0]
+    places = []
+    for camera, outline in zip(scene.cameras, scene.certain, strict=True):
+        if outline is None:
+            continue
+        step = max(1, round(float(spacing(nodes) * camera.intrinsics[0, 0] / camera.position.norm()) / 2))
+        rows, columns = torch.nonzero(outline[::step, ::step] < -0.5 * step, as_tuple=True)
+        pixels = torch.stack([columns, rows], dim=-1) * step + 0.5
+        directions = F.normalize(ray_directions(camera, pixels), dim=-1)
+        directions = directions[_meets_region(scene, camera, directions)]
+        origins = camera.position.expand_as(directions)
+        crossing = first_crossing(
+            lambda x: read(distance, x),
+            origins,
+            directions,
+            sphere_entry(origins / 1.75, directions) * 1.75,
+            reach=3.5,
+            shortest=0.5 * spacing(nodes),
+            steps=48,
+        )
+        missed = ~crossing.hit
+        places.append((origins + crossing.along[:, None] * directions)[missed])
+    points = torch.cat(places) if places else scene.positions[:0]
+    return torch.ones_like(points[:, :1]), locate(points, nodes)
+
+
+def _meets_region(
+    scene: Measurements, camera: Pinhole, directions: Float[Tensor, "rays 3"]
+) -> Bool[Tensor, "rays"]:
+    """Rays that go through the region's inner nine tenths."""
+    apart = scene.region_centre - camera.position
+    along = directions @ apart
+    closest = (apart - along[:, None] * directions).norm(dim=-1)
+    meets: Bool[Tensor, "rays"] = (closest < 0.9 * scene.region_radius) & (along > 0)
+    return meets
+
+
+def _free_distance(scene: Measurements, nodes: int) -> Float[Tensor, "nodes nodes nodes"]:
+    """A lower bound of the distance: > 0 off any silhouette, before any empty backdrop and outside the
+    region; else no bound."""
+    points = node_positions(nodes, scene.positions.device)
+    bound = (points - scene.region_centre).norm(dim=-1) - 0.97 * scene.region_radius
+    bound = torch.maximum(bound, points.abs().amax(dim=-1) - (1 - spacing(nodes)))
+    for camera, outline, backdrop in zip(scene.cameras, scene.outlines, scene.backdrops, strict=True):
+        edge = outline if outline is not None else backdrop
+        if edge is not None:
+            bound = torch.maximum(bound, off_silhouette(camera, edge, nodes))
+    return torch.where(bound > 0, bound, -math.inf)
+
+
+def _seen_through_any(scene: Measurements, nodes: int, margin: float) -> Bool[Tensor, "nodes nodes nodes"]:
+    free = torch.zeros((nodes, nodes, nodes), dtype=torch.bool, device=scene.positions.device)
+    for camera, depth in zip(scene.cameras, scene.depths, strict=True):
+        free |= seen_through(camera, depth, margin, nodes)
+    return free

@@ -1,0 +1,89 @@
+"""All that photographs and stereo say, as tensors in one frame: what the field is fitted to."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float, Float32, Shaped
+from scipy.ndimage import distance_transform_edt
+from torch import Tensor
+
+from ..maths.geometry import Pinhole, pinhole_in_object
+from ..scene import Region, View
+from .stereo import DepthMap, StereoResult
+
+SURE = 0.4
+"""Confidence of a depth that carves: two photographs that agree to 0.8, or three to 0.53."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Measurements:
+    """The views and points as tensors."""
+
+    cameras: list[Pinhole]
+    images: list[Float[Tensor, "3 height width"]]
+    masks: list[Float[Tensor, "height width"] | None]
+    outlines: list[Float[Tensor, "height width"] | None]
+    """Signed distance to the mask's outline in pixels, > 0 off the subject."""
+    backdrops: list[Float[Tensor, "height width"] | None]
+    """The same for an empty backdrop where there is no mask: > 0 on it; what is not on it may be anything."""
+    certain: list[Float[Tensor, "height width"] | None]
+    """The same, < 0 where the subject surely is."""
+    depths: list[Float[Tensor, "height width"]]
+    positions: Float[Tensor, "points 3"]
+    normals: Float[Tensor, "points 3"]
+    colours: Float[Tensor, "points 3"]
+    confidence: Float[Tensor, "points"]
+    region_centre: Float[Tensor, "3"]
+    region_radius: float
+
+
+def measurements(
+    views: tuple[View, ...], region: Region, frame: Region, stereo: StereoResult, device: torch.device
+) -> Measurements:
+    """Everything measured, carried from the region's object frame to another frame."""
+    points = stereo.points
+    frame_from_object = frame.object_from_world @ region.world_from_object
+    scale = region.radius_world / frame.radius_world
+    middle = torch.tensor(frame_from_object[:3, 3], dtype=torch.float32, device=device)
+    images = [torch.tensor(view.image_srgb, device=device).permute(2, 0, 1) for view in views]
+    outlines = [_outline_or_none(view.mask, device) for view in views]
+    empty = [None if m.empty is None else ~m.empty for m in stereo.depth_maps]
+    subject = [_outline_or_none(m.subject, device) for m in stereo.depth_maps]
+    return Measurements(
+        cameras=[pinhole_in_object(view.camera, frame, device) for view in views],
+        images=images,
+        backdrops=[_outline_or_none(known, device) for known in empty],
+        certain=[on if o is None else o for o, on in zip(outlines, subject, strict=True)],
+        masks=[None if v.mask is None else torch.tensor(v.mask, device=device) for v in views],
+        outlines=outlines,
+        depths=[_sure_depth(map_, scale, device) for map_ in stereo.depth_maps],
+        positions=torch.tensor(points.positions, device=device) * scale + middle,
+        normals=torch.tensor(points.normals, device=device),
+        colours=torch.tensor(points.colours_srgb, device=device),
+        confidence=torch.tensor(points.confidence, device=device),
+        region_centre=middle,
+        region_radius=scale,
+    )
+
+
+def _sure_depth(map_: DepthMap, scale: float, device: torch.device) -> Float[Tensor, "height width"]:
+    """Depths sure enough to call what lies before them empty; 0 elsewhere."""
+    return torch.tensor(np.where(map_.confidence > SURE, map_.depth * scale, 0), device=device)
+
+
+def _outline_or_none(
+    mask: Shaped[np.ndarray, "height width"] | None, device: torch.device
+) -> Float[Tensor, "height width"] | None:
+    return None if mask is None else torch.tensor(_outline(mask.astype(np.float32)), device=device)
+
+
+def _outline(mask: Float32[np.ndarray, "height width"]) -> Float32[np.ndarray, "height width"]:
+    """Signed distance in pixels to where the mask crosses one half; > 0 off the subject."""
+    on = mask > 0.5
+    if on.all() or not on.any():
+        return np.where(on, -1e4, 1e4).astype(np.float32)
+    signed: Float32[np.ndarray, "height width"] = distance_transform_edt(~on) - distance_transform_edt(on)
+    # the transform counts from pixel centre to pixel centre; the outline lies half a pixel between them
+    between: Float32[np.ndarray, "height width"] = (signed - 0.5 * np.sign(signed)).astype(np.float32)
+    return between

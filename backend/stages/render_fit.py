@@ -1,0 +1,188 @@
+"""The rendering part of the fit: gradient steps on rays through the photographs and on measured points.
+
+Rays are searched in the field itself, so that samples lie on the surface's two sides and empty space
+costs nothing.
+"""
+
+import math
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from ..maths import losses
+from ..maths.geometry import ray_directions
+from ..maths.grid import laplacian_at, read, spacing, splat
+from ..maths.rays import first_crossing, sphere_entry
+from ..maths.volume import blending_weights, log_transmittance, log_transparency
+from ..scene import Progress
+from .field import SurfaceField
+from .measurements import Measurements
+
+
+@dataclass(frozen=True, kw_only=True)
+class RenderConfig:
+    """How much is sampled in each step."""
+
+    rays: int = 1024
+    edges: int = 9
+    """Edges of the intervals on each ray."""
+    point_queries: int = 4096
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Pixels:
+    """Every pixel worth a ray, of all views."""
+
+    view: Int[Tensor, "pixels"]
+    where: Float[Tensor, "pixels 2"]
+    colour: Float[Tensor, "pixels 3"]
+    coverage: Float[Tensor, "pixels"]
+    """The mask's value, or nan where there is no mask."""
+
+
+def _worthy_pixels(scene: Measurements) -> _Pixels:
+    """On and just around the subject: where the mask is, or where something was measured."""
+    parts = []
+    for index, (image, mask, outline, depth) in enumerate(
+        zip(scene.images, scene.masks, scene.outlines, scene.depths, strict=True)
+    ):
+        near = outline < 8 if outline is not None else F.max_pool2d((depth > 0).float()[None], 5, 1, 2)[0] > 0
+        rows, columns = torch.nonzero(near, as_tuple=True)
+        coverage = (
+            mask[rows, columns] if mask is not None else torch.full_like(rows, math.nan, dtype=torch.float32)
+        )
+        where = torch.stack([columns, rows], dim=-1) + 0.5
+        parts.append((torch.full_like(rows, index), where, image[:, rows, columns].T, coverage))
+    view, where, colour, coverage = (torch.cat(column) for column in zip(*parts, strict=True))
+    return _Pixels(view=view, where=where, colour=colour, coverage=coverage)
+
+
+def _rays(
+    scene: Measurements, pixels: _Pixels, chosen: Int[Tensor, "rays"]
+) -> tuple[Float[Tensor, "rays 3"], Float[Tensor, "rays 3"]]:
+    """Origins and unit directions of chosen pixels."""
+    origins = pixels.where.new_empty((len(chosen), 3))
+    directions = torch.empty_like(origins)
+    view = pixels.view[chosen]
+    for index, camera in enumerate(scene.cameras):
+        mine = view == index
+        origins[mine] = camera.position
+        directions[mine] = F.normalize(ray_directions(camera, pixels.where[chosen[mine]]), dim=-1)
+    return origins, directions
+
+
+def refine(
+    scene: Measurements,
+    distance: Float[Tensor, "nodes nodes nodes"],
+    steps: int,
+    config: RenderConfig,
+    generator: torch.Generator,
+    progress: Progress,
+) -> Float[Tensor, "nodes nodes nodes"]:
+    field = SurfaceField(distance, band_cells=4, channels=6, view_dependent=False, generator=generator)
+    _colour_from_points(field, scene)
+    pixels = _worthy_pixels(scene)
+    h = spacing(field.nodes)
+    optimiser = torch.optim.Adam(
+        [
+            {"params": [field.distances], "lr": 0.015 * h},
+            {"params": [field.features], "lr": 0.02},
+            {"params": [field.first, field.first_bias, field.last, field.last_bias], "lr": 0.01},
+        ],
+        betas=(0.9, 0.99),
+        eps=1e-12,
+    )
+    schedule = torch.optim.lr_scheduler.LambdaLR(optimiser, lambda step: 0.1 ** (step / steps))
+    for step in range(steps):
+        if step % 10 == 0:
+            progress(step / steps, f"rendering at {field.nodes}^3, step {step} of {steps}")
+            whole = field.whole()
+        sharpness = 1 / (h * (1.0 - 0.5 * step / steps))
+        loss = _ray_loss(field, whole, scene, pixels, sharpness, config, generator)
+        loss = loss + _point_loss(field, scene, config, generator) + _shape_loss(field, generator)
+        optimiser.zero_grad(set_to_none=True)
+        torch.autograd.backward(loss)
+        optimiser.step()
+        schedule.step()
+    return field.whole()
+
+
+def _colour_from_points(field: SurfaceField, scene: Measurements) -> None:
+    """Start the features' colour logits at the stereo points' colours."""
+    weight = scene.confidence[:, None]
+    sums = splat(
+        torch.cat([scene.colours * weight, weight], dim=-1), field.locate(scene.positions), field.nodes
+    )
+    mean = (scene.colours * weight).sum(dim=0) / weight.sum()
+    colour = (sums[:, :3] + 1e-3 * mean) / (sums[:, 3:] + 1e-3)
+    with torch.no_grad():
+        field.features[:, :3] = torch.logit(colour[field.active].clamp(0.02, 0.98))
+
+
+def _ray_loss(
+    field: SurfaceField,
+    whole: Float[Tensor, "nodes nodes nodes"],
+    scene: Measurements,
+    pixels: _Pixels,
+    sharpness: float,
+    config: RenderConfig,
+    generator: torch.Generator,
+) -> Float[Tensor, ""]:
+    """Difference between rendered and photographed colours, and between opacity and masks."""
+    chosen = torch.randint(len(pixels.view), (config.rays,), generator=generator).to(pixels.view.device)
+    origins, directions = _rays(scene, pixels, chosen)
+    with torch.no_grad():
+        entry = sphere_entry(origins, directions)
+        crossing = first_crossing(lambda x: read(whole, x), origins, directions, entry)
+    h = spacing(field.nodes)
+    spread = torch.linspace(-3, 3, config.edges, device=origins.device)
+    jitter = torch.rand((config.rays, 1), generator=generator).to(origins.device) - 0.5
+    along = crossing.along[:, None] + h * (spread + jitter * (spread[1] - spread[0]))
+    points = origins[:, None] + along[..., None] * directions[:, None]
+    distances = field.distance(field.locate(points.reshape(-1, 3))).reshape(along.shape)
+    log_pass = log_transmittance(distances, sharpness)
+    weights = blending_weights(log_pass)
+
+    middles = (points[:, 1:] + points[:, :-1]) / 2
+    corners = field.locate(middles.reshape(-1, 3))
+    _, gradient = field.distance_and_gradient(corners)
+    normal = F.normalize(gradient, dim=-1, eps=1e-3)
+    towards = directions[:, None].expand_as(middles).reshape(-1, 3)
+    colour = field.colour(corners, normal, towards).reshape(*middles.shape)
+    opacity = weights.sum(dim=-1)
+    rendered = torch.einsum("ri,ric->rc", weights, colour) / opacity.clamp(min=1e-3)[:, None]
+    coverage = pixels.coverage[chosen]
+    masked = ~coverage.isnan()
+    trust = torch.where(masked, coverage, 1.0) * opacity.detach() * crossing.hit
+    difference = losses.charbonnier(rendered - pixels.colour[chosen], 0.02).mean(dim=-1)
+    loss = (trust * difference).mean() + 0.1 * losses.eikonal(gradient)
+    if masked.any():
+        loss = loss + 0.1 * losses.silhouette(log_transparency(log_pass)[masked], coverage[masked])
+    return loss
+
+
+def _point_loss(
+    field: SurfaceField, scene: Measurements, config: RenderConfig, generator: torch.Generator
+) -> Float[Tensor, ""]:
+    """Both Taylor residuals at queries around the points, in cells."""
+    device = scene.positions.device
+    h = spacing(field.nodes)
+    chosen = torch.randint(len(scene.positions), (config.point_queries,), generator=generator).to(device)
+    noise = torch.randn((config.point_queries, 3), generator=generator).to(device)
+    p = scene.positions[chosen]
+    q = p + 0.5 * h * noise
+    value, gradient = field.distance_and_gradient(field.locate(q))
+    at_query = losses.taylor_at_query(value, gradient, p - q)
+    at_point = losses.taylor_at_point(value, scene.normals[chosen], p - q)
+    both = losses.charbonnier(at_query / h, 0.5) + losses.charbonnier(at_point / h, 0.5)
+    return (scene.confidence[chosen] ** 3 * both).mean()
+
+
+def _shape_loss(field: SurfaceField, generator: torch.Generator) -> Float[Tensor, ""]:
+    """Squared Laplacian at random nodes near the surface, in cells."""
+    chosen = torch.randint(len(field.active), (8192,), generator=generator).to(field.active.device)
+    bent = laplacian_at(field.node_values, field.active[chosen], field.nodes)
+    return 0.5 * (bent / spacing(field.nodes)).square().mean()
