@@ -20,13 +20,17 @@ from ..errors import ErrorCode, ReconstructionError
 from ..maths.grid import near_surface, spacing
 from ..maths.raycast import RayCaster, visible_from
 from ..scene import Decision, Progress, Region, SurfaceMesh, View, transform_points
-from .stereo import StereoResult
+from .stereo import DepthMap, StereoResult
 from .train import Surface
 
 Vertices = Float64[np.ndarray, "vertices 3"]
 Faces = Int64[np.ndarray, "faces 3"]
 KeptVertices = Float64[np.ndarray, "kept_vertices 3"]
 KeptFaces = Int64[np.ndarray, "kept_faces 3"]
+
+
+MEASURED_EDGES = 0.03
+"""Share of the pictures' edges. Measured: 0 to 0.001 for objects, 0.06 to 0.5 for facades and floors."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -69,7 +73,7 @@ def extract_mesh(
     support = support_of(vertices, seen, points, stereo.points.confidence, cell)
     kept = in_seen_pieces(faces, seen)
     if all(view.mask is None for view in views):
-        measured_scene, decision = _open_or_closed(vertices, faces, support, region, cell)
+        measured_scene, decision = _open_or_closed(vertices, faces, support, stereo.depth_maps, cell)
         kept &= measured_scene
         decisions = (decision,)
     used = np.unique(faces[kept])
@@ -202,25 +206,32 @@ def _open_or_closed(
     vertices: Vertices,
     faces: Faces,
     support: Float32[np.ndarray, "vertices"],
-    region: Region,
+    depth_maps: tuple[DepthMap, ...],
     cell: float,
 ) -> tuple[Bool[np.ndarray, "faces"], Decision]:
     """Which faces to keep where there are no masks.
 
-    If measured surface runs into the region's rim, the photographs show a piece of a larger scene, whose
-    back does not exist: surface far from any measurement is cut off. Otherwise the object stays closed.
+    If measured surface runs out of the pictures, they show a piece of a larger scene, whose back does not
+    exist: surface far from any measurement is cut off. Otherwise the object stays closed.
     """
+    at_edges = float(np.mean([measured_at_edges(map_) for map_ in depth_maps]))
+    because = f"{at_edges:.1%} of the pictures' edges show measured surface"
     measured = support > 0.5
-    from_centre = np.linalg.norm(vertices - region.centre_world, axis=1) / region.radius_world
-    at_rim = float((from_centre[measured] > 0.95).mean()) if measured.any() else 0.0
-    if at_rim < 0.05:
-        because = f"{at_rim:.1%} of the measured surface lies at the region's rim"
+    if at_edges < MEASURED_EDGES or not measured.any():
         decision = Decision(what="back side", choice="closed smoothly", because=because)
         return np.ones(len(faces), bool), decision
     distance, _ = cKDTree(vertices[measured]).query(vertices, workers=-1)
     keep_vertex = distance < 8 * cell
-    because = f"{at_rim:.0%} of the measured surface lies at the region's rim: a piece of a larger scene"
-    return keep_vertex[faces].all(axis=1), Decision(what="back side", choice="cut off", because=because)
+    decision = Decision(what="back side", choice="cut off", because=f"{because}: a piece of a larger scene")
+    return keep_vertex[faces].all(axis=1), decision
+
+
+def measured_at_edges(map_: DepthMap) -> float:
+    """Share of a frame just inside the picture where the surface was measured with some confidence."""
+    sure = map_.confidence > 0.3
+    inset = max(4, round(0.02 * min(sure.shape)))
+    frame = [sure[inset], sure[-inset - 1], sure[:, inset], sure[:, -inset - 1]]
+    return float(np.concatenate(frame).mean())
 
 
 def vertex_colours(

@@ -23,7 +23,7 @@ from backend.stages.mesh import (
     vertex_normals,
     without_small_pieces,
 )
-from backend.stages.stereo import StereoResult
+from backend.stages.stereo import DepthMap, StereoResult
 from backend.stages.train import Surface
 from tests.synthetic_scene import (
     CENTRE,
@@ -64,9 +64,21 @@ def ball(centre: list[float], radius: float) -> np.ndarray:
     return np.asarray(np.linalg.norm(apart, axis=1) - SIZE * radius)
 
 
-def measured(points: np.ndarray, region: Region | None = None) -> StereoResult:
-    """Stereo that measured these points of the body, with full confidence."""
+def measured(points: np.ndarray, region: Region | None = None, edge_confidence: float = 0.0) -> StereoResult:
+    """Stereo that measured these points of the body, with full confidence.
+
+    In its depth maps the subject fills the middle; the right edge of the pictures has another confidence.
+    """
     region = region or true_region()
+    confidence = np.zeros((60, 80), np.float32)
+    confidence[20:40, 20:60] = 1.0
+    confidence[:, 72:] = edge_confidence
+    depth_map = DepthMap(
+        depth=np.where(confidence > 0, 3, 0).astype(np.float32),
+        confidence=confidence,
+        empty=None,
+        subject=None,
+    )
     count = len(points)
     found = SurfacePoints(
         positions=transform_points(region.object_from_world, points).astype(np.float32),
@@ -76,7 +88,7 @@ def measured(points: np.ndarray, region: Region | None = None) -> StereoResult:
         num_views=np.full(count, 3),
         view_index=np.zeros(count, np.int64),
     )
-    return StereoResult(points=found, depth_maps=())
+    return StereoResult(points=found, depth_maps=(depth_map, depth_map))
 
 
 def front_points() -> np.ndarray:
@@ -373,7 +385,8 @@ def floor_points() -> np.ndarray:
 
 
 def test_a_piece_of_a_larger_scene_loses_its_back() -> None:
-    mesh = extract(body_scene().without_masks(), floor_surface(), measured(floor_points()))
+    stereo = measured(floor_points(), edge_confidence=0.6)
+    mesh = extract(body_scene().without_masks(), floor_surface(), stereo)
     assert [decision.choice for decision in mesh.decisions] == ["cut off"]
     assert (mesh.vertices[:, 2] > CENTRE[2] - 0.25 * SIZE).all()  # the bottom lies at -0.3
     assert not as_trimesh(mesh.vertices, mesh.faces).is_watertight
@@ -381,6 +394,13 @@ def test_a_piece_of_a_larger_scene_loses_its_back() -> None:
     assert np.pi * (1.1 * SIZE) ** 2 < face_areas(mesh.vertices, mesh.faces).sum() < 0.75 * whole
     lengths = {len(mesh.vertices), len(mesh.normals), len(mesh.colours_srgb), len(mesh.support)}
     assert lengths == {mesh.faces.max() + 1}
+
+
+@pytest.mark.parametrize(("edge_confidence", "choice"), [(0.2, "closed smoothly"), (0.5, "cut off")])
+def test_only_sure_measurements_at_the_edges_open_a_scene(edge_confidence: float, choice: str) -> None:
+    stereo = measured(floor_points(), edge_confidence=edge_confidence)
+    mesh = extract(body_scene().without_masks(), floor_surface(), stereo)
+    assert [decision.choice for decision in mesh.decisions] == [choice]
 
 
 def test_with_masks_nothing_is_cut() -> None:
