@@ -221,7 +221,7 @@ def _open_or_closed(
         decision = Decision(what="back side", choice="closed smoothly", because=because)
         return np.ones(len(faces), bool), decision
     distance, _ = cKDTree(vertices[measured]).query(vertices, workers=-1)
-    keep_vertex = distance < 8 * cell
+    keep_vertex = distance < 5 * cell
     decision = Decision(what="back side", choice="cut off", because=f"{because}: a piece of a larger scene")
     return keep_vertex[faces].all(axis=1), decision
 
