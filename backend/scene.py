@@ -167,6 +167,14 @@ class SurfaceMesh:
     decisions: tuple[Decision, ...] = ()
 
 
+def to_unit_sphere(centre: Float64[np.ndarray, "3"], radius: float) -> Float64[np.ndarray, "4 4"]:
+    """The similarity, without rotation, that maps a sphere to the unit sphere."""
+    unit_from_frame = np.eye(4)
+    unit_from_frame[:3, :3] /= radius
+    unit_from_frame[:3, 3] = -centre / radius
+    return unit_from_frame
+
+
 def transform_points(
     b_from_a: Float[np.ndarray, "4 4"], points: Float[np.ndarray, "*batch 3"]
 ) -> Float[np.ndarray, "*batch 3"]:

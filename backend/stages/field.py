@@ -6,12 +6,13 @@ and, where a scene is glossy, of the direction of view.
 """
 
 import math
+from dataclasses import replace
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from ..maths.grid import Corners, locate, near_surface
+from ..maths.grid import Corners, interpolate_features, locate, near_surface
 
 
 class SurfaceField(nn.Module):
@@ -74,8 +75,8 @@ class SurfaceField(nn.Module):
         direction: Float[Tensor, "points 3"],
     ) -> Float[Tensor, "points 3"]:
         """Colour in sRGB, in (0, 1); the first three features are its logits, the network adds to them."""
-        rows = self.rows[corners.index].clamp(min=0)
-        features = torch.einsum("pc,pcd->pd", corners.weight, self.features[rows])
+        rows = replace(corners, index=self.rows[corners.index].clamp(min=0))
+        features = interpolate_features(self.features, rows)
         seen = [features, normal, direction] if self.view_dependent else [features, normal]
         hidden = torch.relu(torch.cat(seen, dim=-1) @ self.first + self.first_bias)
         return torch.sigmoid(features[:, :3] + hidden @ self.last + self.last_bias)

@@ -12,7 +12,7 @@ from scipy.ndimage import label
 
 from ..errors import ErrorCode, ReconstructionError
 from ..maths.raycast import in_picture
-from ..scene import Camera, Decision, Progress, Region, SolvedCameras, View
+from ..scene import Camera, Decision, Progress, Region, SolvedCameras, View, to_unit_sphere
 
 FEATURES_REACH = 1.1
 """The surface goes on where features end."""
@@ -55,11 +55,8 @@ def find_region(solved: SolvedCameras, config: RegionConfig, *, progress: Progre
 
 
 def _region(centre: Float64[np.ndarray, "3"], radius: float, choice: str, because: str) -> Region:
-    object_from_world = np.eye(4)
-    object_from_world[:3, :3] /= radius
-    object_from_world[:3, 3] = -centre / radius
     decision = Decision(what="region", choice=choice, because=because)
-    return Region(object_from_world=object_from_world, decisions=(decision,))
+    return Region(object_from_world=to_unit_sphere(centre, radius), decisions=(decision,))
 
 
 def nearest_to_axes(cameras: list[Camera]) -> Float64[np.ndarray, "3"]:

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from ..errors import ErrorCode, ReconstructionError
 from ..maths.grid import refined, spacing
-from ..scene import Decision, Progress, Region, View
+from ..scene import Decision, Progress, Region, View, to_unit_sphere
 from .linear_fit import fit_level, start, widest_angle_deg
 from .measurements import Measurements, measurements
 from .render_fit import RenderConfig, refine
@@ -134,7 +134,6 @@ def _tight_frame(distance: Float[Tensor, "nodes nodes nodes"], region: Region) -
         )
     low, high = inside.amin(dim=0), inside.amax(dim=0)
     half = float((high - low).max()) / 2 + 2.5 * spacing(COARSEST)
-    frame_from_object = np.eye(4)
-    frame_from_object[:3, :3] /= half
-    frame_from_object[:3, 3] = -((low + high) / 2).cpu().double().numpy() / half
+    centre = ((low + high) / 2).cpu().double().numpy()
+    frame_from_object = to_unit_sphere(centre, half)
     return Region(object_from_world=frame_from_object @ region.object_from_world)
