@@ -1,17 +1,43 @@
-"""The add-on's side inside Blender: for now it registers and shows nothing."""
+"""The add-on: collects photographs or renders views, has the backend make a mesh, brings it into the scene.
 
-import bpy
+Importing this package needs no Blender; `register` does.
+"""
 
-_CLASSES: tuple[type[bpy.types.bpy_struct], ...] = ()
+from contextlib import ExitStack
+from types import ModuleType
+
+_registered = ExitStack()
+"""What `unregister` takes back, last first."""
+
+
+def _modules() -> tuple[ModuleType, ...]:
+    """Those with something to register, in an order in which each finds what it refers to."""
+    from . import command_line, handlers, panels, preferences, properties
+    from .operators import cameras, environment, images, reconstruct, region, result, views
+
+    operators = (environment, images, views, cameras, region, reconstruct, result)
+    return (preferences, properties, *operators, panels, command_line, handlers)
 
 
 def register() -> None:
-    """Make the add-on's classes known to Blender."""
-    for cls in _CLASSES:
-        bpy.utils.register_class(cls)
+    """Make the add-on known to Blender; where a part fails, nothing stays behind."""
+    with ExitStack() as undo:
+        for module in _modules():
+            _register_classes(module, undo)
+            if hasattr(module, "register"):
+                module.register()
+                undo.callback(module.unregister)
+        _registered.push(undo.pop_all())
 
 
 def unregister() -> None:
-    """Take them back, in the opposite order."""
-    for cls in reversed(_CLASSES):
-        bpy.utils.unregister_class(cls)
+    """Take everything back, in the opposite order."""
+    _registered.close()
+
+
+def _register_classes(module: ModuleType, undo: ExitStack) -> None:
+    import bpy
+
+    for cls in getattr(module, "CLASSES", ()):
+        bpy.utils.register_class(cls)
+        undo.callback(bpy.utils.unregister_class, cls)

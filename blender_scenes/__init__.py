@@ -1,4 +1,4 @@
 """Scenes written as text, rendered to sparse views with exact cameras and the true mesh.
 
-The modules need Blender's Python (`bpy`), except `view_layout`, which needs numpy alone.
+The modules need Blender's Python (`bpy`).
 """

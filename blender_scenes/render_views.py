@@ -23,12 +23,12 @@ from numpy.typing import NDArray
 if not __package__:  # started by `blender --python`, which knows the file and not the package
     sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
+from addon.view_layout import LayoutKind, Lens, ViewLayout, place_cameras
 from blender_scenes.lighting import light_scene
 from blender_scenes.rendering import SENSOR_WIDTH_MM, add_camera, render_view, set_up_cycles
 from blender_scenes.scenes import OWN_SURFACE, SCENES, BuiltScene, build_from_file, build_scene
 from blender_scenes.surfaces import SURFACES
 from blender_scenes.truth import bounding_sphere, depth_and_normals, ray_caster, true_mesh, write_ply
-from blender_scenes.view_layout import LayoutKind, Lens, ViewLayout, place_cameras
 
 MESH_PREFIX = "mesh:"
 log = logging.getLogger(__name__)

@@ -13,7 +13,7 @@ import numpy as np
 from mathutils import Matrix
 from numpy.typing import NDArray
 
-from .view_layout import Lens
+from addon.view_layout import Lens
 
 SENSOR_WIDTH_MM = 36.0
 PNG_SIGNATURE_BYTES = 8

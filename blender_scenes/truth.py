@@ -10,7 +10,7 @@ from mathutils import Vector
 from mathutils.bvhtree import BVHTree
 from numpy.typing import NDArray
 
-from .view_layout import Lens
+from addon.view_layout import Lens
 
 FLAT = 1e-6
 """Volume over the cube of the size, below which a sheet has no inside that could tell its front."""

@@ -1,6 +1,6 @@
-"""The caller's side: start a backend, read what it says, stop it, and give its death a name.
+"""The caller's side: start a program that speaks the wire, read what it says, stop it, name its death.
 
-Whatever happens, exactly one `Finished` or `Failed` comes out, as the last message: a backend that ends
+Whatever happens, exactly one `Finished` or `Failed` comes out, as the last message: a program that ends
 without a last word gets a `Failed` made up from its exit code and the end of its log. Nothing here waits,
 so that a user interface can call it from a timer. Standard library only.
 """
@@ -45,40 +45,55 @@ _WINDOWS_CODES = {
 }
 
 
-class BackendProcess:
-    """A running backend."""
+def backend_command(python: Path | str, *arguments: str) -> tuple[str, ...]:
+    """The command that starts the backend beside this file in the given Python."""
+    return (str(python), "-m", "backend", *arguments)
 
-    def __init__(self, python: Path | str, arguments: Sequence[str], *, log_path: Path) -> None:
-        """Start `python -m backend ARGUMENTS`; its stderr goes to the log file.
 
-        Raises OSError where that Python cannot be started.
+class WireProcess:
+    """A running program that speaks the wire, most often the backend."""
+
+    def __init__(
+        self,
+        command: Sequence[str],
+        *,
+        log_path: Path,
+        environment: Mapping[str, str] | None = None,
+        noisy_start: bool = False,
+    ) -> None:
+        """Start the command; its stderr goes to the log file.
+
+        The environment is `clean_environment` of this process's where none is given. With `noisy_start`,
+        lines before the program's Hello that are no messages are left out: Blender greets before any
+        script runs. Raises OSError where the program cannot be started.
         """
         self._log_path = log_path
+        self._noisy_start = noisy_start
         self._messages: queue.SimpleQueue[Message | ProtocolError | None] = queue.SimpleQueue()
         self._cancelled_s: float | None = None
         self._heard_hello = False
         self._ended = False
         with log_path.open("wb") as log:
             self._process = subprocess.Popen(
-                [str(python), "-m", "backend", *arguments],
+                list(command),
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 stderr=log,
-                env=clean_environment(os.environ),
+                env=clean_environment(os.environ) if environment is None else dict(environment),
                 **_own_group(),
             )
-        threading.Thread(target=self._read, name="backend reader", daemon=True).start()
+        threading.Thread(target=self._read, name="wire reader", daemon=True).start()
 
     @property
     def is_running(self) -> bool:
         """Whether the last message is still to come."""
         return not self._ended
 
-    def poll(self) -> list[Message]:
-        """What the backend said since the last call; never waits."""
+    def poll(self, limit: int = 1000) -> list[Message]:
+        """What the program said since the last call, no more than the limit at once; never waits."""
         self._climb_ladder()
         found: list[Message] = []
-        while not self._ended:
+        while not self._ended and len(found) < limit:
             try:
                 item = self._messages.get_nowait()
             except queue.Empty:
@@ -123,11 +138,14 @@ class BackendProcess:
     def _read(self) -> None:
         """Put every message on the queue, and None at the end; runs in a thread of its own."""
         assert self._process.stdout is not None
+        heard_message = False
         for line in self._process.stdout:
             try:
                 self._messages.put(decode(line.decode("utf-8")))
+                heard_message = True
             except (ProtocolError, UnicodeDecodeError) as error:
-                self._messages.put(ProtocolError(str(error)))
+                if heard_message or not self._noisy_start:
+                    self._messages.put(ProtocolError(str(error)))
         self._process.wait()
         self._process.stdout.close()
         self._messages.put(None)
@@ -160,6 +178,7 @@ def clean_environment(environment: Mapping[str, str]) -> dict[str, str]:
         "PYTHONUTF8": "1",
         "PYTHONNOUSERSITE": "1",
         "PYTHONUNBUFFERED": "1",
+        "PYTHONDONTWRITEBYTECODE": "1",  # the folder of an extension is Blender's, not ours to write to
     }
     return {**kept, **ours}
 

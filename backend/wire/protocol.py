@@ -1,6 +1,6 @@
 """What the backend and its caller say to each other: one JSON object a line, decoded strictly.
 
-The backend speaks first: `Hello`, then any of `Stage`, `Progress`, `Preview`, `Warned`, `Heartbeat`,
+The backend speaks first: `Hello`, then any of `Stage`, `Progress`, `Preview`, `Checked`, `Warned`, `Heartbeat`,
 then exactly one `Finished` or `Failed`, which is the last line. The caller may write `Cancel`; closing
 the pipe says the same. Large data travels by file path. Standard library only: both sides import this
 one file, so neither can misspell the other.
@@ -20,6 +20,10 @@ HEARTBEAT_S = 4.0
 
 PRESETS = ("fast", "balanced", "detailed")
 DEVICES = ("auto", "cpu", "cuda", "mps")
+UNTIL = ("cameras", "report")
+LARGEST_SEED = 2**31 - 1
+LARGEST_LENGTH = 1e9
+"""Of what a region may measure in either direction, in world units."""
 
 CANCELLED = "cancelled"
 """Code of a `Failed` that the user asked for."""
@@ -47,6 +51,11 @@ class Job:
     device: str = "auto"
     seed: int = 0
     truth: str | None = None
+    region_centre: tuple[float, ...] | None = None
+    """Of the sphere to reconstruct, three numbers in the frame of the cameras; None to find it."""
+    region_radius: float | None = None
+    until: str = "report"
+    """The last stage: "cameras" finds cameras and region and ends."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -88,6 +97,16 @@ class Preview:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Checked:
+    """One thing that `doctor` looked at."""
+
+    name: str
+    fine: bool
+    found: str
+    """A version, a device or what is wrong."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class Warned:
     """The run goes on, and the user should know this."""
 
@@ -123,7 +142,7 @@ class Cancel:
     """From the caller: stop, and keep what is done."""
 
 
-Message = Hello | Stage | Progress | Preview | Warned | Heartbeat | Finished | Failed | Cancel
+Message = Hello | Stage | Progress | Preview | Checked | Warned | Heartbeat | Finished | Failed | Cancel
 MESSAGES: dict[str, Callable[..., Message]] = {
     kind.__name__.lower(): kind for kind in typing.get_args(Message)
 }
@@ -157,10 +176,25 @@ def decode_job(text: str) -> Job:
     found = _json_object(text)
     check_version(found.get("protocol"))
     job = _record(Job, found, "job")
-    for name, value, known in (("preset", job.preset, PRESETS), ("device", job.device, DEVICES)):
+    choices = (("preset", job.preset, PRESETS), ("device", job.device, DEVICES), ("until", job.until, UNTIL))
+    for name, value, known in choices:
         if value not in known:
             raise ProtocolError(f"job: {name} is {value!r}; known: {', '.join(known)}")
+    if not 0 <= job.seed <= LARGEST_SEED:
+        raise ProtocolError(f"job: seed is {job.seed}; it must be from 0 to {LARGEST_SEED}")
+    _check_region(job)
     return job
+
+
+def _check_region(job: Job) -> None:
+    """ProtocolError unless the region is left out or a sphere of sensible numbers."""
+    centre, radius = job.region_centre, job.region_radius
+    if centre is None and radius is None:
+        return
+    if centre is None or radius is None or len(centre) != 3:
+        raise ProtocolError("job: region_centre (three numbers) and region_radius go together")
+    if max(map(abs, centre)) > LARGEST_LENGTH or not 1 / LARGEST_LENGTH <= radius <= LARGEST_LENGTH:
+        raise ProtocolError(f"job: the region at {centre} with radius {radius} is too large or too small")
 
 
 def check_version(found: object) -> None:

@@ -16,11 +16,11 @@ from bpy_extras.object_utils import world_to_camera_view  # noqa: E402
 from mathutils import Vector  # noqa: E402
 from mathutils.bvhtree import BVHTree  # noqa: E402
 
+from addon.view_layout import LayoutKind, Lens, ViewLayout, place_cameras  # noqa: E402
 from blender_scenes.render_views import RenderJob, main, own_words, render_views  # noqa: E402
 from blender_scenes.rendering import add_camera, set_up_cycles  # noqa: E402
 from blender_scenes.scenes import OWN_SURFACE, SCENES, build_from_file, build_scene  # noqa: E402
 from blender_scenes.truth import TrueMesh, bounding_sphere, true_mesh, write_ply  # noqa: E402
-from blender_scenes.view_layout import LayoutKind, Lens, ViewLayout, place_cameras  # noqa: E402
 
 pytestmark = pytest.mark.blender
 

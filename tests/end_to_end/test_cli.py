@@ -20,7 +20,7 @@ from PIL import Image
 
 from backend.mesh_files import read_mesh
 from backend.wire import protocol
-from backend.wire.client import BackendProcess, clean_environment
+from backend.wire.client import WireProcess, backend_command, clean_environment
 from backend.wire.protocol import Failed, Finished, Hello, Job, Message, decode
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -169,7 +169,7 @@ def test_rehearse_plays_the_whole_conversation_without_any_package(case: Case) -
 
 
 def test_the_client_and_a_rehearsal_understand_each_other(case: Case) -> None:
-    process = BackendProcess(sys.executable, ["rehearse"], log_path=case.folder / "log")
+    process = WireProcess(backend_command(sys.executable, "rehearse"), log_path=case.folder / "log")
     heard: list[Message] = []
     while process.is_running:
         heard += process.poll()

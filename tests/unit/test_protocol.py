@@ -14,7 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from backend.wire import client, protocol
-from backend.wire.client import BackendProcess, clean_environment, describe_crash
+from backend.wire.client import WireProcess, backend_command, clean_environment, describe_crash
 from backend.wire.protocol import (
     PROTOCOL_VERSION,
     Failed,
@@ -35,6 +35,9 @@ VALUES = {
     float: st.floats(allow_nan=False, allow_infinity=False),
     float | None: st.none() | st.floats(allow_nan=False, allow_infinity=False),
     str | None: st.none() | st.text(),
+    bool: st.booleans(),
+    tuple[float, ...] | None: st.none()
+    | st.lists(st.floats(allow_nan=False, allow_infinity=False)).map(tuple),
     tuple[str, ...]: st.lists(st.text(), max_size=3).map(tuple),
 }
 
@@ -58,7 +61,8 @@ def test_every_message_comes_back(message: Message) -> None:
 @given(any_of(Job), st.sampled_from(protocol.PRESETS), st.sampled_from(protocol.DEVICES))
 def test_every_job_comes_back(job: Job, preset: str, device: str) -> None:
     values = {f.name: getattr(job, f.name) for f in fields(job)}
-    valid = Job(**{**values, "preset": preset, "device": device})
+    sensible = {"seed": job.seed % 1000, "region_centre": (0.0, 1.5, -2.0), "region_radius": 3.0}
+    valid = Job(**{**values, **sensible, "preset": preset, "device": device, "until": "cameras"})
     assert decode_job(encode_job(valid)) == valid
 
 
@@ -136,7 +140,23 @@ def test_another_version_is_named_even_if_its_fields_differ(version: object) -> 
 
 
 @pytest.mark.parametrize(
-    "change", [{"preset": "best"}, {"device": "tpu"}, {"seed": 1.5}, {"images": "a.png"}]
+    "change",
+    [
+        {"preset": "best"},
+        {"device": "tpu"},
+        {"until": "tomorrow"},
+        {"seed": 1.5},
+        {"seed": -1},
+        {"seed": 2**40},
+        {"images": "a.png"},
+        {"region_centre": [0, 0, 0]},
+        {"region_radius": 1},
+        {"region_centre": [0, 0], "region_radius": 1},
+        {"region_centre": [0, 0, 1e300], "region_radius": 1},
+        {"region_centre": [0, 0, 0], "region_radius": 0},
+        {"region_centre": [0, 0, 0], "region_radius": -1},
+        {"region_centre": [0, 0, "0"], "region_radius": 1},
+    ],
 )
 def test_a_job_with_a_wrong_value_is_refused(change: dict[str, object]) -> None:
     job = {"protocol": PROTOCOL_VERSION, "images": ["a"], "output": "o"}
@@ -170,7 +190,7 @@ hello = Hello(protocol=PROTOCOL_VERSION, backend="0", python="3", pid=os.getpid(
 """
 
 
-def start(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, body: str) -> BackendProcess:
+def start(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, body: str) -> WireProcess:
     """A backend that runs the body instead of ours."""
     package = tmp_path / "fake" / "backend"
     package.mkdir(parents=True)
@@ -179,10 +199,10 @@ def start(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, body: str) -> Backend
     wire.symlink_to(Path(protocol.__file__).parent, target_is_directory=True)
     (package / "__main__.py").write_text(FAKE.format(root=str(package.parent)) + body)
     monkeypatch.setattr(client, "ROOT", package.parent)
-    return BackendProcess(sys.executable, [], log_path=tmp_path / "backend.log")
+    return WireProcess(backend_command(sys.executable), log_path=tmp_path / "backend.log")
 
 
-def listen(backend: BackendProcess, limit_s: float = 10.0) -> list[Message]:
+def listen(backend: WireProcess, limit_s: float = 10.0) -> list[Message]:
     """All messages until the last one."""
     heard: list[Message] = []
     deadline = time.monotonic() + limit_s
@@ -284,7 +304,7 @@ def test_closing_ends_a_backend_that_hangs(monkeypatch: pytest.MonkeyPatch, tmp_
 
 def test_a_python_that_is_not_there_is_an_os_error(tmp_path: Path) -> None:
     with pytest.raises(OSError, match="no-python"):
-        BackendProcess(tmp_path / "no-python", [], log_path=tmp_path / "log")
+        WireProcess(backend_command(tmp_path / "no-python"), log_path=tmp_path / "log")
 
 
 def test_the_callers_python_settings_do_not_reach_the_backend() -> None:

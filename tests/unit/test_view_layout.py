@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from blender_scenes.view_layout import (
+from addon.view_layout import (
     Array,
     LayoutKind,
     Lens,

@@ -1,0 +1,115 @@
+"""Where the files of a job lie; no Blender needed.
+
+    PARENT/reconstruct-001/     job.json      what was asked for
+                                backend.log   what the backend's libraries said
+                                result/       the backend's own folder: mesh.ply, cameras.json, report.html ...
+    PARENT/views-001/           rendered views: images/, transforms.json, truth.ply
+
+A job never writes outside its folder, and a name that a backend gives is only taken if it lies inside.
+"""
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+from ..backend.wire.protocol import Job, ProtocolError, decode_job, encode_job
+
+JOB_FILE, LOG, RESULT = "job.json", "backend.log", "result"
+MESH, CAMERAS, REPORT_PAGE, REPORT_NUMBERS, SPARSE = (
+    "mesh.ply",
+    "cameras.json",
+    "report.html",
+    "report.json",
+    "sparse.ply",
+)
+_LARGEST_JOB_BYTES = 1_000_000
+
+
+class FolderError(ValueError):
+    """A file or folder that cannot be used, in a sentence for the user."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class PastJob:
+    """A job on disk that has a mesh."""
+
+    folder: Path
+    job: Job
+
+    @property
+    def result(self) -> Path:
+        """Folder of the results."""
+        return self.folder / RESULT
+
+
+def new_folder(parent: Path, kind: str) -> Path:
+    """A folder of its own for a job: PARENT/KIND-NNN, the number one more than the last.
+
+    Raises FolderError where it cannot be made.
+    """
+    try:
+        parent.mkdir(parents=True, exist_ok=True)
+        pattern = re.compile(re.escape(kind) + r"-(\d+)")
+        numbers = [int(m[1]) for entry in parent.iterdir() if (m := pattern.fullmatch(entry.name))]
+        number = max(numbers, default=0)
+        while True:
+            number += 1
+            folder = parent / f"{kind}-{number:03d}"
+            try:
+                folder.mkdir()
+            except FileExistsError:  # another Blender was quicker
+                continue
+            return folder
+    except OSError as error:
+        raise FolderError(f"{parent} cannot be written ({error.strerror or error})") from error
+
+
+def write_job(folder: Path, job: Job) -> Path:
+    """Write job.json; its path."""
+    path = folder / JOB_FILE
+    part = path.with_suffix(".part")
+    part.write_text(encode_job(job), encoding="utf-8")
+    part.replace(path)
+    return path
+
+
+def read_job(folder: Path) -> PastJob:
+    """The job of a folder that has a mesh. Raises FolderError where there is none or it is damaged."""
+    path = folder / JOB_FILE
+    try:
+        if path.stat().st_size > _LARGEST_JOB_BYTES:
+            raise FolderError(f"{path} is too large to be a job")
+        job = decode_job(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, ProtocolError) as error:
+        raise FolderError(f"{path} cannot be read: {error}") from error
+    inside(folder, folder / job.output)
+    if not (folder / RESULT / MESH).is_file():
+        raise FolderError(f"The job {folder.name} has no mesh yet")
+    return PastJob(folder=folder, job=job)
+
+
+def past_jobs(parent: Path) -> tuple[PastJob, ...]:
+    """The jobs with a mesh in a folder, the newest first; folders that are no such jobs are left out."""
+    found: list[tuple[float, PastJob]] = []
+    try:
+        entries = list(parent.iterdir())
+    except OSError:
+        return ()
+    for entry in entries:
+        try:
+            job = read_job(entry)
+            found.append(((job.result / MESH).stat().st_mtime, job))
+        except (FolderError, OSError):
+            continue
+    return tuple(job for _, job in sorted(found, key=lambda item: item[0], reverse=True))
+
+
+def inside(folder: Path, path: Path) -> Path:
+    """The path, resolved. Raises FolderError where it leaves the folder."""
+    try:
+        resolved = path.resolve()
+        if resolved.is_relative_to(folder.resolve()):
+            return resolved
+    except (OSError, ValueError, RuntimeError) as error:  # a null byte, a loop of links
+        raise FolderError(f"{path!s} is no usable path ({error})") from error
+    raise FolderError(f"{path} lies outside of the job's folder {folder}")

@@ -1,0 +1,324 @@
+"""The one job that runs: how it is started, followed, cancelled, and how the last one ended.
+
+A job is a program that speaks the wire: the backend, or a second Blender that renders. In a window an app
+timer follows it and never takes long; in background mode, where timers do not run, `follow` waits. This
+state is Python's alone: no .blend holds it, and loading a file or undoing does not touch it.
+"""
+
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import bpy
+
+from ..backend.wire.client import WireProcess
+from ..backend.wire.protocol import (
+    CANCELLED,
+    Checked,
+    Failed,
+    Finished,
+    Message,
+    Preview,
+    Progress,
+    Stage,
+    Warned,
+)
+from .job_folder import FolderError, inside
+
+TICK_S = 0.1
+"""Time between two looks at a running job."""
+_BUDGET_S = 0.008
+"""Of one look; what is left waits for the next. Single steps of an import may take longer."""
+_MESSAGES_PER_TICK = 100
+_REFUSED = "result_refused"
+"""Code of a failure on this side: what came back could not be used."""
+
+Steps = Iterator[None]
+"""Work on the scene in steps that are short enough for a timer."""
+
+
+class JobError(RuntimeError):
+    """A job that cannot be started, in a sentence for the user."""
+
+
+@dataclass(kw_only=True)
+class RunningJob:
+    """What is known of the job that runs."""
+
+    title: str
+    process: WireProcess
+    folder: Path
+    """Every file that the job names lies in here."""
+    log_path: Path
+    on_finished: Callable[[Finished], Steps]
+    on_preview: Callable[[Path], Steps] | None
+    started_s: float = field(default_factory=time.monotonic)
+    stage: str = ""
+    stage_index: int = 0
+    stage_count: int = 0
+    fraction: float = 0.0
+    """Of the stage."""
+    text: str = ""
+    remaining_s: float | None = None
+    """Of the stage."""
+    warnings: list[str] = field(default_factory=list)
+    checks: list[Checked] = field(default_factory=list)
+    cancelling: bool = False
+    heard_s: float = field(default_factory=time.monotonic)
+    """When the program last said anything."""
+    pending: Steps | None = None
+    finished: bool = False
+
+    @property
+    def total_fraction(self) -> float:
+        """Of the whole job, 0 to 1, as if all stages took the same time."""
+        if not self.stage_count:
+            return 0.0
+        return min((max(self.stage_index - 1, 0) + self.fraction) / self.stage_count, 1.0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class EndedJob:
+    """How a job ended."""
+
+    title: str
+    failure: Failed | None
+    warnings: tuple[str, ...]
+    checks: tuple[Checked, ...]
+    log_path: Path
+    seconds: float
+
+    @property
+    def cancelled(self) -> bool:
+        """Whether it ended because the user asked for it."""
+        return self.failure is not None and self.failure.code == CANCELLED
+
+
+_running: RunningJob | None = None
+_ended: EndedJob | None = None
+longest_tick_s = 0.0
+"""The longest that the timer has kept Blender from its user, for the tests."""
+
+
+def running() -> RunningJob | None:
+    """The job that runs now."""
+    return _running
+
+
+def ended() -> EndedJob | None:
+    """The job that ended last; None after `forget`."""
+    return _ended
+
+
+def forget() -> None:
+    """Show no more how the last job ended."""
+    global _ended
+    _ended = None
+
+
+def start(
+    title: str,
+    command: Sequence[str],
+    *,
+    folder: Path,
+    log_path: Path,
+    on_finished: Callable[[Finished], Steps],
+    on_preview: Callable[[Path], Steps] | None = None,
+    environment: Mapping[str, str] | None = None,
+    noisy_start: bool = False,
+) -> None:
+    """Start a job; `follow` must be called next. Raises JobError where that is not possible now."""
+    global _running, _ended, longest_tick_s
+    if _running is not None:
+        raise JobError(f"{_running.title} is still running; wait for it or cancel it")
+    try:
+        process = WireProcess(command, log_path=log_path, environment=environment, noisy_start=noisy_start)
+    except OSError as error:
+        raise JobError(f"{command[0]} cannot be started ({error.strerror or error})") from error
+    _ended = None
+    longest_tick_s = 0.0
+    _running = RunningJob(
+        title=title,
+        process=process,
+        folder=folder,
+        log_path=log_path,
+        on_finished=on_finished,
+        on_preview=on_preview,
+    )
+
+
+def follow(operator: bpy.types.Operator) -> set[str]:
+    """What the operator that started the job returns; without a window it waits for the job's end."""
+    if not bpy.app.background:
+        bpy.app.timers.register(_tick, first_interval=TICK_S, persistent=True)
+        return {"FINISHED"}
+    end = wait()
+    for text in end.warnings:
+        operator.report({"WARNING"}, text)
+    if end.failure is None:
+        return {"FINISHED"}
+    operator.report({"ERROR"}, f"{end.failure.text} {end.failure.remedy}".strip())
+    return {"CANCELLED"}
+
+
+def wait() -> EndedJob:
+    """Follow the running job to its end, with its progress on stderr; Ctrl-C cancels it."""
+    assert _running is not None
+    before = signal.signal(signal.SIGINT, lambda *_: cancel())
+    shown = ""
+    try:
+        while _running is not None:
+            line = f"{_running.stage} {_running.text}".strip()
+            if line and line != shown:
+                sys.stderr.write(f"FewView: {line}\n")
+                shown = line
+            _advance(None)
+            time.sleep(0.02)
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert _ended is not None
+    return _ended
+
+
+def cancel() -> None:
+    """Ask the running job to stop."""
+    if _running is not None:
+        _running.cancelling = True
+        _running.process.cancel()
+
+
+def stop() -> None:
+    """End the running job at once: the add-on is switched off, or Blender quits."""
+    global _running
+    if _running is not None:
+        _running.process.close()
+        _running = None
+    if bpy.app.timers.is_registered(_tick):
+        bpy.app.timers.unregister(_tick)
+
+
+def detach(reason: str) -> None:
+    """Let the running job go on without touching the scene: its results stay in its folder."""
+    if _running is not None and _running.on_preview is not None:
+        _running.warnings.append(reason)
+    if _running is not None:
+        _running.pending = iter(()) if _running.pending is not None else None
+        _running.on_preview, _running.on_finished = None, lambda _: iter(())
+
+
+def redraw() -> None:
+    """Have the panels drawn again."""
+    for window in bpy.context.window_manager.windows:
+        for area in window.screen.areas:
+            if area.type in {"VIEW_3D", "PREFERENCES"}:
+                area.tag_redraw()
+
+
+def _tick() -> float | None:
+    """The timer's callback: a short look at the job, and again after TICK_S while it runs."""
+    global longest_tick_s
+    started = time.perf_counter()
+    changed = _advance(started + _BUDGET_S)
+    if changed:
+        redraw()
+    longest_tick_s = max(longest_tick_s, time.perf_counter() - started)
+    if _running is None:
+        return None
+    return 0.0 if _running.pending is not None else TICK_S
+
+
+def _advance(deadline: float | None) -> bool:
+    """Take in what the job said and go on with its steps; whether anything happened."""
+    job = _running
+    if job is None:
+        return False
+    if job.pending is None and not job.finished:
+        messages = job.process.poll(_MESSAGES_PER_TICK)
+        for message in messages:
+            _take_in(job, message)
+        if not messages:
+            return False
+    while job.pending is not None and _running is job:
+        _step(job)
+        if deadline is not None and time.perf_counter() >= deadline:
+            break
+    if job.finished and job.pending is None and _running is job:
+        _end(job, None)
+    return True
+
+
+def _step(job: RunningJob) -> None:
+    """One step of work on the scene; a failure in it ends the job, not Blender."""
+    assert job.pending is not None
+    try:
+        next(job.pending)
+    except StopIteration:
+        job.pending = None
+    except (FolderError, ValueError, OSError, RuntimeError, MemoryError) as error:
+        job.pending = None
+        if job.finished:
+            _end(job, _refused(str(error)))
+        else:
+            job.warnings.append(f"A preview could not be shown: {error}")
+
+
+def _take_in(job: RunningJob, message: Message) -> None:
+    job.heard_s = time.monotonic()
+    match message:
+        case Stage():
+            job.stage, job.stage_index, job.stage_count = message.name, message.index, message.count
+            job.fraction, job.text, job.remaining_s = 0.0, "", None
+        case Progress():
+            job.fraction, job.text = min(max(message.fraction, 0.0), 1.0), message.text
+            job.remaining_s = message.remaining_s
+        case Warned():
+            job.warnings.append(message.text)
+        case Checked():
+            job.checks.append(message)
+        case Preview() if job.on_preview is not None:
+            job.pending = _checked(job, Path(message.path), job.on_preview)
+        case Finished():
+            job.finished = True
+            job.pending = _finishing(job, message)
+        case Failed():
+            _end(job, message)
+
+
+def _checked(job: RunningJob, path: Path, show: Callable[[Path], Steps]) -> Steps:
+    yield from show(inside(job.folder, path))
+
+
+def _finishing(job: RunningJob, message: Finished) -> Steps:
+    output = inside(job.folder, Path(message.output or job.folder))
+    for name in message.files:
+        inside(output, output / name)
+    yield from job.on_finished(message)
+
+
+def _refused(text: str) -> Failed:
+    return Failed(
+        code=_REFUSED,
+        text=f"What came back cannot be used: {text}.",
+        remedy="Install the backend and the add-on from the same version of FewView.",
+    )
+
+
+def _end(job: RunningJob, failure: Failed | None) -> None:
+    """Keep how the job ended."""
+    global _running, _ended
+    # In a thread: a program that has said its last word may take a second to end.
+    threading.Thread(target=job.process.close, name="job's end", daemon=True).start()
+    _running = None
+    _ended = EndedJob(
+        title=job.title,
+        failure=failure,
+        warnings=tuple(job.warnings),
+        checks=tuple(job.checks),
+        log_path=job.log_path,
+        seconds=time.monotonic() - job.started_s,
+    )
+    redraw()

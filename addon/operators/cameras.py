@@ -1,0 +1,3 @@
+"""cameras."""
+
+CLASSES = ()

@@ -1,0 +1,3 @@
+"""reconstruct."""
+
+CLASSES = ()

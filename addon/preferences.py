@@ -1,0 +1,56 @@
+"""The add-on's preferences: which Python reconstructs, and where jobs go."""
+
+import bpy
+from bpy.props import EnumProperty, StringProperty
+
+from .. import __package__ as EXTENSION
+
+
+class FEWVIEW_AP_preferences(bpy.types.AddonPreferences):
+    """Preferences of FewView"""
+
+    bl_idname = EXTENSION
+
+    backend_python: StringProperty(
+        name="Python",
+        description="Python that has torch and pycolmap; the managed environment where this is empty",
+        subtype="FILE_PATH",
+    )
+    environment_folder: StringProperty(
+        name="Environment Folder",
+        description="Where the managed environment is made; the extension's user folder where this is empty",
+        subtype="DIR_PATH",
+    )
+    torch_build: EnumProperty(
+        name="Compute On",
+        items=[
+            ("cpu", "CPU", "The smallest download, for every computer"),
+            ("default", "Usual", "What the package index offers for this system; on a Mac it has MPS"),
+            ("cuda", "CUDA", "For a GPU by NVIDIA; the largest download"),
+        ],
+    )
+    output: StringProperty(
+        name="Output",
+        description="Folder for the jobs of .blend files that are not saved yet",
+        subtype="DIR_PATH",
+        default="~/FewView",
+    )
+
+    def draw(self, context: bpy.types.Context) -> None:
+        """The page in Edit > Preferences > Add-ons."""
+        from .panels import draw_environment
+
+        layout = self.layout
+        layout.use_property_split = True
+        draw_environment(layout, context)
+        layout.prop(self, "backend_python")
+        layout.prop(self, "environment_folder")
+        layout.prop(self, "output")
+
+
+CLASSES = (FEWVIEW_AP_preferences,)
+
+
+def preferences_of(context: bpy.types.Context) -> FEWVIEW_AP_preferences:
+    """The preferences of this add-on."""
+    return context.preferences.addons[EXTENSION].preferences

@@ -1,0 +1,213 @@
+"""The settings of a scene: what the user chose, and nothing about what runs.
+
+Everything is in `scene.fewview`, one group, and is saved with the .blend.
+"""
+
+import bpy
+from bpy.props import (
+    BoolProperty,
+    CollectionProperty,
+    EnumProperty,
+    FloatProperty,
+    IntProperty,
+    PointerProperty,
+    StringProperty,
+)
+
+
+class FEWVIEW_PG_image(bpy.types.PropertyGroup):
+    """One photograph of the list"""
+
+    path: StringProperty(name="File", subtype="FILE_PATH")
+    use: BoolProperty(name="Use", description="Reconstruct from this photograph", default=True)
+    width: IntProperty(name="Width", description="In pixels; 0 where it is not known")
+    height: IntProperty(name="Height", description="In pixels; 0 where it is not known")
+    problem: StringProperty(name="Problem", description="Why this photograph may not be usable")
+
+
+class FEWVIEW_PG_settings(bpy.types.PropertyGroup):
+    """Settings of FewView"""
+
+    # 1. Images
+    source: EnumProperty(
+        name="Source",
+        items=[
+            ("FILES", "Photographs", "Image files from a disk"),
+            ("RENDER", "Render from Scene", "Views of an object of this scene, with exact cameras"),
+        ],
+    )
+    images: CollectionProperty(type=FEWVIEW_PG_image)
+    active_image: IntProperty(name="Active Photograph")
+    masks: StringProperty(
+        name="Masks",
+        description="Folder with an image per photograph, white on the subject; may be empty",
+        subtype="DIR_PATH",
+    )
+
+    # 1b. Render from scene
+    target: PointerProperty(
+        name="Object",
+        description="Object to look at; the active one where this is empty",
+        type=bpy.types.Object,
+    )
+    view_cameras: EnumProperty(
+        name="Cameras",
+        items=[
+            ("GENERATED", "Generated", "Cameras that Generate Cameras made around the object"),
+            ("SELECTED", "Selected", "The selected cameras"),
+            ("ANIMATED", "Animated", "The scene's camera, at every so many frames"),
+        ],
+    )
+    layout: EnumProperty(
+        name="Layout",
+        items=[
+            ("ARC", "Arc", "Side by side in front of the object"),
+            ("RING", "Ring", "All around the object"),
+            ("HEMISPHERE", "Hemisphere", "All around and from above"),
+        ],
+    )
+    view_count: IntProperty(name="Views", description="Number of cameras", default=6, min=2, soft_max=20)
+    arc: FloatProperty(
+        name="Arc",
+        description="Angle between the first camera and the last",
+        subtype="ANGLE",
+        default=2.0943951,
+        min=0.0872665,
+        max=6.1086524,
+    )
+    azimuth: FloatProperty(
+        name="Azimuth",
+        description="Middle of the arc; 0 looks along the object's Y axis",
+        subtype="ANGLE",
+        default=0.0,
+    )
+    elevation: FloatProperty(
+        name="Elevation",
+        description="Height of the cameras over the object, as an angle",
+        subtype="ANGLE",
+        default=0.34906585,
+        min=-1.4835298,
+        max=1.4835298,
+    )
+    jitter: FloatProperty(
+        name="Irregularity",
+        description="How irregularly the cameras stand, as if held by hand",
+        subtype="FACTOR",
+        default=0.3,
+        min=0.0,
+        max=1.0,
+    )
+    view_seed: IntProperty(name="Seed", description="Of the irregularity", default=0, min=0)
+    radius: FloatProperty(
+        name="Distance",
+        description="Of the cameras from the object; 0 fits the object into every picture",
+        subtype="DISTANCE",
+        default=0.0,
+        min=0.0,
+    )
+    lens_mm: FloatProperty(
+        name="Focal Length",
+        description="Of generated cameras",
+        subtype="DISTANCE_CAMERA",
+        default=50.0,
+        min=1.0,
+    )
+    frame_step: IntProperty(name="Every", description="Frames between two views", default=10, min=1)
+    engine: EnumProperty(
+        name="Engine",
+        items=[
+            ("CYCLES", "Cycles", "Realistic, on any computer"),
+            ("WORKBENCH", "Workbench", "Quick, without light and materials of the scene"),
+            ("SCENE", "As the Scene", "The scene's own render engine"),
+        ],
+    )
+    samples: IntProperty(name="Samples", description="Light paths per pixel in Cycles", default=32, min=1)
+    resolution_x: IntProperty(name="Resolution X", default=800, min=32, max=8192, subtype="PIXEL")
+    resolution_y: IntProperty(name="Y", default=600, min=32, max=8192, subtype="PIXEL")
+
+    # 2. Cameras
+    camera_source: EnumProperty(
+        name="Cameras",
+        items=[
+            ("ESTIMATE", "Estimate", "Find from the photographs where they were taken"),
+            ("KNOWN", "Known", "Read them from a file: transforms.json, or a COLMAP model"),
+        ],
+    )
+    cameras_path: StringProperty(
+        name="File or Folder",
+        description="A transforms.json, or the folder of a COLMAP model",
+        subtype="FILE_PATH",
+    )
+    cameras_job: StringProperty(
+        name="Cameras Job", description="Folder with the cameras found in step 2", subtype="DIR_PATH"
+    )
+    root: PointerProperty(
+        name="Placement",
+        description="Empty that places the estimated cameras and their mesh in the scene",
+        type=bpy.types.Object,
+    )
+
+    # 3. Region
+    region: PointerProperty(
+        name="Region",
+        description="Sphere around what is to be reconstructed; found automatically where this is empty",
+        type=bpy.types.Object,
+    )
+
+    # 4. Reconstruct
+    preset: EnumProperty(
+        name="Preset",
+        items=[
+            ("fast", "Fast", "A first look"),
+            ("balanced", "Balanced", "Good for most subjects"),
+            ("detailed", "Detailed", "Fine structures, for sharp and large photographs"),
+        ],
+        default="balanced",
+    )
+    device: EnumProperty(
+        name="Device",
+        items=[
+            ("auto", "Automatic", "The fastest there is"),
+            ("cpu", "CPU", "The processor"),
+            ("cuda", "CUDA", "A GPU by NVIDIA"),
+            ("mps", "MPS", "The GPU of a Mac with Apple silicon"),
+        ],
+    )
+    seed: IntProperty(name="Seed", description="Of all chance in the reconstruction", default=0, min=0)
+    output: StringProperty(
+        name="Output",
+        description="Folder for jobs; beside the .blend, or the one of the preferences, where this is empty",
+        subtype="DIR_PATH",
+    )
+    truth: StringProperty(
+        name="Truth", description="Mesh file that the result is measured against", subtype="FILE_PATH"
+    )
+
+    # 5. Result
+    result: PointerProperty(name="Result", description="Mesh that was imported last", type=bpy.types.Object)
+    decimate_ratio: FloatProperty(
+        name="Ratio",
+        description="Share of triangles to keep",
+        subtype="FACTOR",
+        default=0.25,
+        min=0.001,
+        max=1.0,
+    )
+
+
+CLASSES = (FEWVIEW_PG_image, FEWVIEW_PG_settings)
+
+
+def register() -> None:
+    """Give every scene its settings."""
+    bpy.types.Scene.fewview = PointerProperty(type=FEWVIEW_PG_settings)
+
+
+def unregister() -> None:
+    """Take the settings away; what is saved in .blend files stays there."""
+    del bpy.types.Scene.fewview
+
+
+def settings_of(context: bpy.types.Context) -> FEWVIEW_PG_settings:
+    """The settings of the scene that is worked on."""
+    return context.scene.fewview

@@ -1,0 +1,60 @@
+"""The add-on as its users have it: built into a zip, installed and enabled, in a Blender of its own."""
+
+import importlib
+import os
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+EXTENSION = "bl_ext.user_default.fewview"
+
+# Before bpy is imported: the tests must neither see nor change the settings of the person who runs them.
+_resources = tempfile.TemporaryDirectory(prefix="fewview-blender-")
+os.environ["BLENDER_USER_RESOURCES"] = _resources.name
+
+
+@pytest.fixture(scope="session")
+def extension_zip(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The extension, built by Blender's own tool."""
+    bpy = pytest.importorskip("bpy", reason="needs Blender's Python, where `import bpy` works")
+    folder = tmp_path_factory.mktemp("zip")
+    tool = Path(bpy.utils.system_resource("SCRIPTS")) / "addons_core/bl_pkg/cli/blender_ext.py"
+    command = [sys.executable, str(tool), "build", "--source-dir", str(ROOT), "--output-dir", str(folder)]
+    subprocess.run(command, check=True, capture_output=True, timeout=60)
+    (found,) = folder.glob("*.zip")
+    return found
+
+
+@pytest.fixture(scope="session")
+def extension(extension_zip: Path) -> Iterator[str]:
+    """The package name of the installed and enabled extension."""
+    import addon_utils
+    import bpy
+
+    bpy.ops.extensions.package_install_files(
+        filepath=str(extension_zip), repo="user_default", enable_on_install=True, overwrite=True
+    )
+    assert EXTENSION in bpy.context.preferences.addons
+    yield EXTENSION
+    addon_utils.disable(EXTENSION)  # Blender 4.2 dies at exit where a class of ours is left
+
+
+@pytest.fixture
+def scene(extension: str) -> object:
+    """An empty scene with the add-on's settings."""
+    import bpy
+
+    bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
+    return bpy.context.scene
+
+
+@pytest.fixture
+def addon(scene: object, extension: str) -> ModuleType:
+    """The installed add-on's package `addon`, in an empty scene."""
+    return importlib.import_module(f"{extension}.addon")
