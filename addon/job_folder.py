@@ -2,7 +2,7 @@
 
     PARENT/reconstruct-001/     job.json      what was asked for
                                 backend.log   what the backend's libraries said
-                                result/       the backend's own folder: mesh.ply, cameras.json, report.html ...
+                                result/       the backend's own folder: mesh.ply, cameras.json
     PARENT/views-001/           rendered views: images/, transforms.json, truth.ply
 
 A job never writes outside its folder, and a name that a backend gives is only taken if it lies inside.

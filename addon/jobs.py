@@ -28,6 +28,7 @@ from ..backend.wire.protocol import (
     Warned,
 )
 from .job_folder import FolderError, inside
+from .progress import total_share
 
 TICK_S = 0.1
 """Time between two looks at a running job."""
@@ -56,15 +57,17 @@ class RunningJob:
     log_path: Path
     on_finished: Callable[[Finished], Steps]
     on_preview: Callable[[Path], Steps] | None
+    on_end: Callable[[], None] | None
+    about_scene: bool
+    """Whether what comes back belongs to the file that is open."""
     started_s: float = field(default_factory=time.monotonic)
     stage: str = ""
+    stages_before: list[str] = field(default_factory=list)
     stage_index: int = 0
     stage_count: int = 0
     fraction: float = 0.0
     """Of the stage."""
     text: str = ""
-    remaining_s: float | None = None
-    """Of the stage."""
     warnings: list[str] = field(default_factory=list)
     checks: list[Checked] = field(default_factory=list)
     cancelling: bool = False
@@ -74,11 +77,21 @@ class RunningJob:
     finished: bool = False
 
     @property
-    def total_fraction(self) -> float:
-        """Of the whole job, 0 to 1, as if all stages took the same time."""
+    def share(self) -> float:
+        """Of the whole job, 0 to 1."""
         if not self.stage_count:
             return 0.0
-        return min((max(self.stage_index - 1, 0) + self.fraction) / self.stage_count, 1.0)
+        return total_share(self.stages_before, self.stage, self.stage_count - self.stage_index, self.fraction)
+
+    @property
+    def silent_s(self) -> float:
+        """For how long it has said nothing."""
+        return time.monotonic() - self.heard_s
+
+    @property
+    def elapsed_s(self) -> float:
+        """Since it was started."""
+        return time.monotonic() - self.started_s
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -128,10 +141,16 @@ def start(
     log_path: Path,
     on_finished: Callable[[Finished], Steps],
     on_preview: Callable[[Path], Steps] | None = None,
+    on_end: Callable[[], None] | None = None,
+    about_scene: bool = True,
     environment: Mapping[str, str] | None = None,
     noisy_start: bool = False,
 ) -> None:
-    """Start a job; `follow` must be called next. Raises JobError where that is not possible now."""
+    """Start a job; `follow` must be called next.
+
+    `on_finished` and `on_preview` work on the scene in short steps, `on_end` cleans up however the job
+    ended. Raises JobError where a job runs already or this one cannot be started.
+    """
     global _running, _ended, longest_tick_s
     if _running is not None:
         raise JobError(f"{_running.title} is still running; wait for it or cancel it")
@@ -148,6 +167,8 @@ def start(
         log_path=log_path,
         on_finished=on_finished,
         on_preview=on_preview,
+        on_end=on_end,
+        about_scene=about_scene,
     )
 
 
@@ -203,11 +224,17 @@ def stop() -> None:
 
 def detach(reason: str) -> None:
     """Let the running job go on without touching the scene: its results stay in its folder."""
-    if _running is not None and _running.on_preview is not None:
-        _running.warnings.append(reason)
-    if _running is not None:
-        _running.pending = iter(()) if _running.pending is not None else None
-        _running.on_preview, _running.on_finished = None, lambda _: iter(())
+    job = _running
+    if job is not None and job.about_scene:
+        job.warnings.append(reason)
+        job.on_preview, job.on_finished, job.on_end = None, lambda _: iter(()), None
+        job.pending = None if job.pending is None else iter(())
+
+
+def log_path() -> Path | None:
+    """Log of the running job, or of the one that ended last."""
+    job = _running or _ended
+    return None if job is None else job.log_path
 
 
 def redraw() -> None:
@@ -270,11 +297,12 @@ def _take_in(job: RunningJob, message: Message) -> None:
     job.heard_s = time.monotonic()
     match message:
         case Stage():
+            if job.stage:
+                job.stages_before.append(job.stage)
             job.stage, job.stage_index, job.stage_count = message.name, message.index, message.count
-            job.fraction, job.text, job.remaining_s = 0.0, "", None
+            job.fraction, job.text = 0.0, ""
         case Progress():
             job.fraction, job.text = min(max(message.fraction, 0.0), 1.0), message.text
-            job.remaining_s = message.remaining_s
         case Warned():
             job.warnings.append(message.text)
         case Checked():
@@ -313,12 +341,14 @@ def _end(job: RunningJob, failure: Failed | None) -> None:
     # In a thread: a program that has said its last word may take a second to end.
     threading.Thread(target=job.process.close, name="job's end", daemon=True).start()
     _running = None
+    if job.on_end is not None:
+        job.on_end()
     _ended = EndedJob(
         title=job.title,
         failure=failure,
         warnings=tuple(job.warnings),
         checks=tuple(job.checks),
         log_path=job.log_path,
-        seconds=time.monotonic() - job.started_s,
+        seconds=job.elapsed_s,
     )
     redraw()

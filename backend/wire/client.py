@@ -139,16 +139,18 @@ class WireProcess:
         """Put every message on the queue, and None at the end; runs in a thread of its own."""
         assert self._process.stdout is not None
         heard_message = False
-        for line in self._process.stdout:
-            try:
-                self._messages.put(decode(line.decode("utf-8")))
-                heard_message = True
-            except (ProtocolError, UnicodeDecodeError) as error:
-                if heard_message or not self._noisy_start:
-                    self._messages.put(ProtocolError(str(error)))
-        self._process.wait()
-        self._process.stdout.close()
-        self._messages.put(None)
+        try:
+            for line in self._process.stdout:
+                try:
+                    self._messages.put(decode(line.decode("utf-8")))
+                    heard_message = True
+                except (ProtocolError, UnicodeDecodeError) as error:
+                    if heard_message or not self._noisy_start:
+                        self._messages.put(ProtocolError(str(error)))
+            self._process.wait()
+            self._process.stdout.close()
+        finally:
+            self._messages.put(None)  # whatever happens: who waits for the end would wait for ever
 
     def _climb_ladder(self) -> None:
         if self._cancelled_s is None or self._process.poll() is not None:

@@ -216,7 +216,9 @@ def _json_object(text: str) -> dict[str, object]:
 
     try:
         found = json.loads(text, parse_constant=no_constant, object_pairs_hook=no_repeats)
-    except (json.JSONDecodeError, RecursionError) as error:
+    except ProtocolError:
+        raise
+    except (ValueError, RecursionError) as error:  # ValueError: no JSON, or a number of thousands of digits
         raise ProtocolError(f"not JSON: {text[:80]!r}") from error
     if not isinstance(found, dict):
         raise ProtocolError(f"not a JSON object: {text[:80]!r}")
@@ -245,7 +247,10 @@ def _value(hint: object, value: object, where: str) -> object:
         item_hint = typing.get_args(hint)[0]
         return tuple(_value(item_hint, item, where) for item in value)
     if hint is float and type(value) is int:
-        return float(value)  # JSON writers may drop the ".0"
+        try:
+            return float(value)  # JSON writers may drop the ".0"
+        except OverflowError as error:
+            raise ProtocolError(f"{where} is larger than any float") from error
     if type(value) is not hint:  # exact: a bool is no int
         raise ProtocolError(f"{where} is {value!r}, expected {getattr(hint, '__name__', hint)}")
     return value

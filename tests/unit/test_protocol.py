@@ -97,6 +97,7 @@ def test_the_line_that_the_next_test_damages_is_fine() -> None:
         {"fraction": True},
         {"fraction": float("nan")},
         {"fraction": float("inf")},
+        {"fraction": 10**400},
         {"stage": 3},
         {"text": None},
         {"colour": "red"},
@@ -118,6 +119,11 @@ def test_true_is_no_number() -> None:
     assert decode(json.dumps(stage)) == protocol.Stage(name="mesh", index=1, count=7)
     with pytest.raises(ProtocolError, match="index"):
         decode(json.dumps({**stage, "index": True}))
+
+
+def test_a_number_of_thousands_of_digits_is_refused() -> None:
+    with pytest.raises(ProtocolError):
+        decode('{"type": "heartbeat", "elapsed_s": ' + "9" * 5000 + "}")
 
 
 def test_a_repeated_key_is_refused() -> None:

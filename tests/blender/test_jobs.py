@@ -1,0 +1,266 @@
+"""Jobs from Blender's side: what they say is followed, and whatever they do, Blender lives."""
+
+import importlib
+import json
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import pytest
+
+bpy = pytest.importorskip("bpy", reason="needs Blender's Python, where `import bpy` works")
+
+pytestmark = pytest.mark.blender
+
+HELLO = {"type": "hello", "protocol": 1, "backend": "0", "python": "3", "pid": 1}
+PROGRESS = {"type": "progress", "stage": "mesh", "fraction": 0.5, "text": "half", "remaining_s": None}
+PROGRAM = """
+import sys, time, os
+for line in open({lines!r}, encoding="utf-8"):
+    sys.stdout.write(line)
+sys.stdout.flush()
+{then}
+"""
+TICK_LIMIT_S = 0.020
+
+
+@pytest.fixture
+def jobs(addon: ModuleType) -> Iterator[ModuleType]:
+    found = importlib.import_module(f"{addon.__name__}.jobs")
+    found.stop()
+    found.forget()
+    yield found
+    found.stop()
+
+
+def say(folder: Path, *lines: object, then: str = "") -> tuple[str, ...]:
+    """The command of a program that says the lines and then does something."""
+    path = folder / "lines"
+    texts = [line if isinstance(line, str) else json.dumps(line) for line in lines]
+    path.write_text("".join(text + "\n" for text in texts), encoding="utf-8")
+    program = folder / "program.py"
+    program.write_text(PROGRAM.format(lines=str(path), then=then), encoding="utf-8")
+    return (sys.executable, str(program))
+
+
+def finished(output: object, *files: str) -> dict[str, object]:
+    return {"type": "finished", "output": str(output), "files": list(files)}
+
+
+def run(jobs: ModuleType, folder: Path, command: tuple[str, ...], **options: Any) -> Any:
+    """Start the command and follow it to its end."""
+    started: list[object] = []
+
+    def on_finished(message: object) -> Iterator[None]:
+        started.append(message)
+        yield
+
+    options = {"on_finished": on_finished, **options}
+    jobs.start("Testing", command, folder=folder, log_path=folder / "log", **options)
+    end = jobs.wait()
+    assert (end.failure is None) == bool(started) or "on_finished" in options
+    return end
+
+
+def tick_until(jobs: ModuleType, done: Callable[[], bool], limit_s: float = 20.0) -> None:
+    """Call the timer's callback as Blender would."""
+    deadline = time.monotonic() + limit_s
+    while not done():
+        assert time.monotonic() < deadline, "it did not come to an end"
+        interval = jobs._tick()
+        time.sleep(0.01 if interval is None else min(interval, 0.02))
+
+
+def test_what_it_says_is_known(jobs: ModuleType, tmp_path: Path) -> None:
+    lines = (HELLO, {"type": "warned", "text": "dark"}, PROGRESS, finished(tmp_path))
+    end = run(jobs, tmp_path, say(tmp_path, *lines))
+    assert end.failure is None
+    assert end.warnings == ("dark",)
+    assert jobs.running() is None
+    assert jobs.ended() is end
+
+
+@pytest.mark.parametrize(
+    ("lines", "word"),
+    [
+        ((HELLO, "rubbish"), "not JSON"),
+        ((HELLO, {"type": "explode"}), "unknown message"),
+        ((HELLO, {**PROGRESS, "fraction": "much"}), "fraction"),
+        ((HELLO, '{"type": "heartbeat", "elapsed_s": NaN}'), "NaN"),
+        ((HELLO, "[" * 100_000), "not JSON"),
+        (({**HELLO, "protocol": 99},), "protocol 99"),
+        ((PROGRESS,), "hello"),
+        ((HELLO, finished("/etc")), "outside"),
+        ((HELLO, finished("..")), "outside"),
+        ((HELLO, finished("", "../../secret")), "outside"),
+        ((HELLO, finished("", "\0")), "path"),
+        ((HELLO,), "without a result"),
+        ((), "without a result"),
+    ],
+)
+def test_a_hostile_program_ends_its_job_alone(
+    jobs: ModuleType, tmp_path: Path, lines: tuple[object, ...], word: str
+) -> None:
+    end = run(jobs, tmp_path, say(tmp_path, *lines))
+    assert end.failure is not None
+    assert word in end.failure.text
+    assert jobs.running() is None
+
+
+def test_huge_numbers_do_no_harm(jobs: ModuleType, tmp_path: Path) -> None:
+    huge = [{**PROGRESS, "fraction": value} for value in (1e308, -1e308, 10**400)]
+    end = run(jobs, tmp_path, say(tmp_path, HELLO, *huge[:2], finished(tmp_path)))
+    assert end.failure is None
+    end = run(jobs, tmp_path, say(tmp_path, HELLO, huge[2], finished(tmp_path)))
+    assert end.failure is not None
+
+
+def test_a_preview_outside_is_not_shown(jobs: ModuleType, tmp_path: Path) -> None:
+    shown: list[Path] = []
+
+    def show(path: Path) -> Iterator[None]:
+        shown.append(path)
+        yield
+
+    inside = tmp_path / "preview.ply"
+    paths = ["/etc/passwd", str(inside)]
+    previews = [{"type": "preview", "path": path} for path in paths]
+    program = say(tmp_path, HELLO, *previews[:1], then="time.sleep(0.3)")
+    with (tmp_path / "program.py").open("a") as file:
+        file.write(f"print({json.dumps(json.dumps(previews[1]))}, flush=True)\ntime.sleep(0.3)\n")
+        file.write(f"print({json.dumps(json.dumps(finished(tmp_path)))}, flush=True)\n")
+    end = run(jobs, tmp_path, program, on_preview=show)
+    assert shown == [inside.resolve()]
+    assert any("preview" in text for text in end.warnings)
+
+
+def test_a_crash_has_a_name_and_its_log(jobs: ModuleType, tmp_path: Path) -> None:
+    then = "sys.stderr.write('the last words'); sys.stderr.flush(); os.abort()"
+    end = run(jobs, tmp_path, say(tmp_path, HELLO, then=then))
+    assert end.failure.code == "crashed"
+    assert "the last words" in end.failure.text
+    if sys.platform != "win32":
+        assert "SIGABRT" in end.failure.text
+
+
+@pytest.mark.parametrize(
+    "error", [ValueError("odd"), OSError("gone"), RuntimeError("removed"), MemoryError()]
+)
+def test_a_result_that_cannot_be_used_is_a_failure(
+    jobs: ModuleType, tmp_path: Path, error: Exception
+) -> None:
+    def on_finished(_: object) -> Iterator[None]:
+        yield
+        raise error
+
+    ends: list[str] = []
+    end = run(
+        jobs,
+        tmp_path,
+        say(tmp_path, HELLO, finished(tmp_path)),
+        on_finished=on_finished,
+        on_end=lambda: ends.append("cleaned"),
+    )
+    assert end.failure.code == "result_refused"
+    assert ends == ["cleaned"]
+
+
+def test_one_at_a_time(jobs: ModuleType, tmp_path: Path) -> None:
+    command = say(tmp_path, HELLO, then="time.sleep(60)")
+    options = {"folder": tmp_path, "log_path": tmp_path / "log", "on_finished": lambda _: iter(())}
+    jobs.start("Testing", command, **options)
+    with pytest.raises(jobs.JobError, match="still running"):
+        jobs.start("Testing", command, **options)
+    jobs.stop()
+    jobs.start("Testing", command, **options)
+
+
+def test_a_program_that_is_not_there(jobs: ModuleType, tmp_path: Path) -> None:
+    with pytest.raises(jobs.JobError, match="cannot be started"):
+        jobs.start(
+            "Testing",
+            (str(tmp_path / "none"),),
+            folder=tmp_path,
+            log_path=tmp_path / "log",
+            on_finished=lambda _: iter(()),
+        )
+    assert jobs.running() is None
+
+
+def test_the_timer_is_quick_and_comes_to_the_end(jobs: ModuleType, tmp_path: Path) -> None:
+    lines = [HELLO, *[PROGRESS] * 2000, finished(tmp_path)]
+    seen: list[float] = []
+
+    def on_finished(_: object) -> Iterator[None]:
+        for _step in range(20):
+            time.sleep(0.004)
+            yield
+
+    jobs.start(
+        "Testing", say(tmp_path, *lines), folder=tmp_path, log_path=tmp_path / "log", on_finished=on_finished
+    )
+
+    def done() -> bool:
+        seen.append(jobs.running().share if jobs.running() else 1.0)
+        return jobs.ended() is not None
+
+    tick_until(jobs, done)
+    assert jobs.ended().failure is None
+    assert 0 < jobs.longest_tick_s < TICK_LIMIT_S
+
+
+def test_cancel_is_answered_at_once(jobs: ModuleType, tmp_path: Path) -> None:
+    stage = {"type": "stage", "name": "mesh", "index": 1, "count": 1}
+    failed = {"type": "failed", "code": "cancelled", "text": "Stopped.", "remedy": ""}
+    then = f"sys.stdin.readline(); print({json.dumps(json.dumps(failed))}, flush=True)"
+    command = say(tmp_path, HELLO, stage, then=then)
+    jobs.start("Testing", command, folder=tmp_path, log_path=tmp_path / "log", on_finished=lambda _: iter(()))
+    tick_until(jobs, lambda: jobs.running().stage == "mesh")
+    started = time.monotonic()
+    jobs.cancel()
+    assert jobs.running().cancelling
+    tick_until(jobs, lambda: jobs.ended() is not None)
+    assert time.monotonic() - started < 1.0
+    assert jobs.ended().cancelled
+
+
+def test_another_file_keeps_the_job_off_the_scene(jobs: ModuleType, tmp_path: Path) -> None:
+    touched: list[str] = []
+
+    def on_finished(_: object) -> Iterator[None]:
+        touched.append("scene")
+        yield
+
+    command = say(
+        tmp_path, HELLO, then=f"sys.stdin.readline(); print({json.dumps(json.dumps(finished(tmp_path)))})"
+    )
+    jobs.start("Testing", command, folder=tmp_path, log_path=tmp_path / "log", on_finished=on_finished)
+    bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
+    assert jobs.running() is not None
+    jobs.cancel()  # here it makes the program finish
+    tick_until(jobs, lambda: jobs.ended() is not None)
+    assert jobs.ended().failure is None
+    assert touched == []
+    assert "Another file" in jobs.ended().warnings[0]
+
+
+def test_switching_the_add_on_off_ends_the_job(addon: ModuleType, jobs: ModuleType, tmp_path: Path) -> None:
+    then = f"open({str(tmp_path / 'pid')!r}, 'w').write(str(os.getpid())); sys.stdin.readline()"
+    jobs.start(
+        "Testing",
+        say(tmp_path, HELLO, then=then),
+        folder=tmp_path,
+        log_path=tmp_path / "log",
+        on_finished=lambda _: iter(()),
+    )
+    process = jobs.running().process
+    addon.unregister()
+    try:
+        assert jobs.running() is None
+        assert process._process.poll() is not None
+        assert not bpy.app.timers.is_registered(jobs._tick)
+    finally:
+        addon.register()
