@@ -1,1 +1,143 @@
-"""blender --command fewview."""
+"""`blender --command fewview ...`: the add-on without a window.
+
+    blender --command fewview reconstruct photos --output jobs --save mesh.blend
+    blender scene.blend --command fewview render --object Suzanne --views 6 --output views
+
+Exit codes: 0 fine, 1 a fault of the program, 2 something the user can mend, 130 stopped.
+"""
+
+import argparse
+import json
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import bpy
+
+from ..backend.wire.protocol import CANCELLED, CRASHED, DEVICES, PRESETS
+from . import jobs
+from .api import ReconstructionFailed, reconstruct
+from .job_folder import RESULT
+
+NAME = "fewview"
+EXIT_FINE, EXIT_FAULT, EXIT_USER_ERROR, EXIT_CANCELLED = 0, 1, 2, 130
+_FAULTS = frozenset({CRASHED, "internal", "protocol_broken", "result_refused"})
+
+
+def main(words: Sequence[str]) -> int:
+    """Run a command; its exit code. The last line on stdout is a JSON object with what came of it."""
+    parser = _parser()
+    try:
+        asked = parser.parse_args(list(words))
+    except SystemExit as ending:  # argparse has said why
+        return int(ending.code or 0)
+    try:
+        summary = asked.run(asked)
+    except ReconstructionFailed as error:
+        return _failed(str(error), _exit_code(error.failure.code))
+    except (ValueError, RuntimeError, OSError) as error:
+        return _failed(str(error), EXIT_USER_ERROR)
+    sys.stdout.write(json.dumps(summary) + "\n")
+    sys.stdout.flush()
+    return EXIT_FINE
+
+
+def _reconstruct(asked: argparse.Namespace) -> dict[str, object]:
+    done = reconstruct(
+        asked.images,
+        output=asked.output,
+        cameras=asked.cameras,
+        masks=asked.masks,
+        truth=asked.truth,
+        preset=asked.preset,
+        device=asked.device,
+        seed=asked.seed,
+    )
+    if asked.save is not None:
+        bpy.ops.wm.save_as_mainfile(filepath=str(asked.save.absolute()), check_existing=False)
+    return {
+        "mesh": done.mesh.name,
+        "triangles": len(done.mesh.data.polygons),
+        "result": str(done.folder / RESULT),
+        "warnings": list(done.warnings),
+    }
+
+
+def _render(asked: argparse.Namespace) -> dict[str, object]:
+    target = bpy.data.objects.get(asked.object)
+    if target is None:
+        known = ", ".join(o.name for o in bpy.context.scene.objects if o.type == "MESH")
+        raise ValueError(f"There is no object {asked.object!r} in the scene; meshes: {known or 'none'}")
+    names = ("arrangement", "view_count", "view_seed", "resolution_x", "resolution_y")
+    placed = {name: value for name in names if (value := getattr(asked, name)) is not None}
+    names = ("samples", "engine", "resolution_x", "resolution_y")
+    rendered = {name: value for name in names if (value := getattr(asked, name)) is not None}
+    bpy.ops.fewview.generate_views(target=target.name, **placed)
+    bpy.ops.fewview.render_views(target=target.name, output=str(asked.output.absolute()), **rendered)
+    settings = bpy.context.scene.fewview
+    return {"transforms": settings.cameras_path, "images": [image.path for image in settings.images]}
+
+
+def _check(_asked: argparse.Namespace) -> dict[str, object]:
+    bpy.ops.fewview.check_backend()
+    end = jobs.ended()
+    assert end is not None
+    return {check.name: check.found for check in end.checks}
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog=f"blender --command {NAME}", description="From photographs to a mesh."
+    )
+    commands = parser.add_subparsers(required=True)
+    making = commands.add_parser("reconstruct", help="make a mesh from photographs")
+    making.set_defaults(run=_reconstruct)
+    add = making.add_argument
+    add("images", nargs="+", type=Path, help="image files or folders")
+    add("--output", type=Path, required=True, help="folder in which the job gets its own")
+    add("--cameras", type=Path, help="transforms.json or COLMAP model; else they are estimated")
+    add("--masks", type=Path, help="folder with an image per photograph, white on the subject")
+    add("--truth", type=Path, help="mesh file to measure the result against")
+    add("--preset", choices=PRESETS, default="balanced")
+    add("--device", choices=DEVICES, default="auto")
+    add("--seed", type=int, default=0)
+    add("--save", type=Path, metavar="FILE.blend", help="save the scene with the mesh; replaces that file")
+    rendering = commands.add_parser("render", help="render sparse views of an object of the .blend")
+    rendering.set_defaults(run=_render)
+    add = rendering.add_argument
+    add("--object", required=True, help="name of the object")
+    add("--output", type=Path, required=True, help="folder in which the views get their own")
+    add("--views", type=int, dest="view_count")
+    add("--layout", type=str.upper, dest="arrangement", choices=("ARC", "RING", "HEMISPHERE"))
+    add("--seed", type=int, dest="view_seed")
+    add("--width", type=int, dest="resolution_x")
+    add("--height", type=int, dest="resolution_y")
+    add("--samples", type=int)
+    add("--engine", type=str.upper, choices=("CYCLES", "WORKBENCH", "SCENE"))
+    commands.add_parser("check", help="check the backend").set_defaults(run=_check)
+    return parser
+
+
+def _exit_code(code: str) -> int:
+    if code == CANCELLED:
+        return EXIT_CANCELLED
+    return EXIT_FAULT if code in _FAULTS else EXIT_USER_ERROR
+
+
+def _failed(text: str, exit_code: int) -> int:
+    sys.stderr.write(f"Error: {text}\n")
+    return exit_code
+
+
+_command: Callable[..., object] | None = None
+
+
+def register() -> None:
+    """Make the command known."""
+    global _command
+    _command = bpy.utils.register_cli_command(NAME, main)
+
+
+def unregister() -> None:
+    """Take it back."""
+    bpy.utils.unregister_cli_command(_command)

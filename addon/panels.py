@@ -1,5 +1,399 @@
-"""The sidebar."""
+"""The sidebar: five steps, each with its state in one line and at most one main button."""
+
+import textwrap
+from pathlib import Path
+
+import bpy
+
+from . import jobs
+from .colours import legend
+from .environment import State
+from .error_map import numbers_of
+from .job_folder import past_jobs
+from .operators.environment import backend_state
+from .operators.images import list_problems
+from .operators.reconstruct import jobs_parent
+from .progress import seconds_left, stage_words, time_words
+from .properties import settings_of
+from .result_numbers import result_lines
+from .state_lines import StepState, cameras_state, images_state, region_state, result_state, solved_or_none
+
+_SILENCE_S = 30.0
+_MAIN_SCALE = 1.5
+_MOST_PAST_JOBS = 8
+_PIXELS_PER_LETTER = 7.0
 
 
-def draw_environment(layout: object, context: object) -> None:
-    """The state of the backend."""
+class _Panel:
+    """Mix-in: a panel of the sidebar's FewView tab."""
+
+    bl_space_type = "VIEW_3D"
+    bl_region_type = "UI"
+    bl_category = "FewView"
+
+
+class _Step(_Panel):
+    """Mix-in: one of the five steps."""
+
+    bl_parent_id = "FEWVIEW_PT_main"
+
+
+class FEWVIEW_PT_main(_Panel, bpy.types.Panel):
+    """What runs, how the last job ended, and whether there is a backend"""
+
+    bl_label = "FewView"
+    bl_idname = "FEWVIEW_PT_main"
+
+    def draw(self, context: bpy.types.Context) -> None:
+        """Above the steps."""
+        job, end = jobs.running(), jobs.ended()
+        if job is not None:
+            _draw_running(self.layout.box(), context, job)
+        elif end is not None and (end.failure is not None or end.warnings):
+            _draw_ended(self.layout.box(), context, end)
+        if job is None and backend_state(context)[0] is not State.READY:
+            draw_environment(self.layout.box(), context)
+
+
+class FEWVIEW_UL_images(bpy.types.UIList):
+    """The photographs"""
+
+    def draw_item(self, _context, layout, _data, item, _icon, _active, _property, *_):
+        """A tick, the name, the size or what is wrong."""
+        row = layout.row(align=True)
+        row.prop(item, "use", text="")
+        row.label(text=item.name, icon="ERROR" if item.problem else "NONE")
+        size = row.row()
+        size.alignment = "RIGHT"
+        size.enabled = False
+        size.label(text=f"{item.width} x {item.height}" if item.width else "")
+
+
+class FEWVIEW_PT_images(_Step, bpy.types.Panel):
+    """Step 1"""
+
+    bl_label = "1. Images"
+    bl_idname = "FEWVIEW_PT_images"
+
+    def draw(self, context: bpy.types.Context) -> None:
+        """Source, list, and what is wrong with it."""
+        layout, settings = self.layout, settings_of(context)
+        _draw_state(layout, images_state(settings))
+        layout.row().prop(settings, "source", expand=True)
+        if settings.source == "RENDER":
+            _draw_render(layout, context)
+        elif not settings.images:
+            _main_button(layout, "fewview.add_images", icon="FILE_FOLDER", text="Add Photographs...")
+            _draw_text(layout, context, "3 to 20 pictures of one thing, each from a step further round it")
+        if settings.images:
+            _draw_list(layout, context)
+
+
+class FEWVIEW_PT_cameras(_Step, bpy.types.Panel):
+    """Step 2"""
+
+    bl_label = "2. Cameras"
+    bl_idname = "FEWVIEW_PT_cameras"
+
+    def draw(self, context: bpy.types.Context) -> None:
+        """Where they come from, and who could not be placed."""
+        layout, settings = self.layout, settings_of(context)
+        _draw_state(layout, cameras_state(settings))
+        layout.row().prop(settings, "camera_source", expand=True)
+        known = settings.camera_source == "KNOWN"
+        if known:
+            layout.prop(settings, "cameras_path", text="")
+        solved = solved_or_none(settings)
+        text = "Load Cameras" if known else "Estimate Cameras"
+        row = layout.row(align=True)
+        _main_button(row, "fewview.estimate_cameras", icon="OUTLINER_DATA_CAMERA", text=text)
+        if solved is None:
+            return
+        row.operator("fewview.remove_cameras", icon="X", text="")
+        if solved.reprojection_error_px is not None:
+            layout.label(text=f"Accurate to {solved.reprojection_error_px:.1f} pixels")
+        for name, why in solved.unplaced:
+            box = layout.box()
+            box.label(text=f"{name} could not be placed", icon="ERROR")
+            _draw_text(box, context, why)
+
+
+class FEWVIEW_PT_region(_Step, bpy.types.Panel):
+    """Step 3"""
+
+    bl_label = "3. Region"
+    bl_idname = "FEWVIEW_PT_region"
+    bl_options = {"DEFAULT_CLOSED"}
+
+    def draw(self, context: bpy.types.Context) -> None:
+        """A sphere, or nothing."""
+        layout, settings = self.layout, settings_of(context)
+        _draw_state(layout, region_state(settings))
+        if settings.region is None:
+            _main_button(layout, "fewview.add_region", icon="SPHERE", text="Add Region")
+            return
+        row = layout.row(align=True)
+        _main_button(row, "fewview.fit_region", icon="FULLSCREEN_EXIT", text="Fit to Subject")
+        row.operator("fewview.remove_region", icon="X", text="")
+        layout.prop(settings.region, "location")
+        layout.prop(settings.region, "scale")
+
+
+class FEWVIEW_PT_reconstruct(_Step, bpy.types.Panel):
+    """Step 4"""
+
+    bl_label = "4. Reconstruct"
+    bl_idname = "FEWVIEW_PT_reconstruct"
+
+    def draw(self, context: bpy.types.Context) -> None:
+        """Preset and start."""
+        layout, settings = self.layout, settings_of(context)
+        layout.row().prop(settings, "preset", expand=True)
+        _main_button(layout, "fewview.reconstruct", icon="MOD_REMESH", text="Reconstruct")
+        reason = _why_not(context)
+        if reason:
+            _draw_text(layout, context, reason)
+
+
+class FEWVIEW_PT_advanced(_Panel, bpy.types.Panel):
+    """Rarely needed"""
+
+    bl_label = "Advanced"
+    bl_parent_id = "FEWVIEW_PT_reconstruct"
+    bl_options = {"DEFAULT_CLOSED"}
+
+    def draw(self, context: bpy.types.Context) -> None:
+        """Where to compute, where to write, what to compare with."""
+        layout, settings = self.layout, settings_of(context)
+        layout.use_property_split = True
+        layout.use_property_decorate = False
+        layout.prop(settings, "device")
+        layout.prop(settings, "seed")
+        layout.prop(settings, "output", placeholder=str(jobs_parent(context)))
+        layout.prop(settings, "masks")
+        layout.prop(settings, "truth")
+
+
+class FEWVIEW_PT_result(_Step, bpy.types.Panel):
+    """Step 5"""
+
+    bl_label = "5. Result"
+    bl_idname = "FEWVIEW_PT_result"
+
+    def draw(self, context: bpy.types.Context) -> None:
+        """The mesh, how far to trust it, and what to do with it."""
+        layout, settings = self.layout, settings_of(context)
+        _draw_state(layout, result_state(settings))
+        if settings.result is None:
+            return
+        folder = settings.result.get("fewview_job", "")
+        for line in result_lines(Path(folder)) if folder else ():
+            layout.label(text=line)
+        layout.label(text="Show on the mesh:")
+        row = layout.row(align=True)
+        row.operator("fewview.show_colour")
+        row.operator("fewview.show_support")
+        row.operator("fewview.show_error")
+        _draw_text(layout, context, legend(settings.result.data))
+        if settings.target is not None:
+            layout.operator("fewview.measure_error", icon="DRIVER_DISTANCE")
+            numbers = numbers_of(settings.result)
+            if numbers is not None:
+                _draw_text(layout, context, numbers.text)
+        column = layout.column(align=True)
+        row = column.row(align=True)
+        row.prop(settings, "decimate_ratio")
+        row.operator("fewview.decimate", text="Decimate")
+        column.operator("fewview.remesh", icon="MOD_REMESH")
+        column.operator("fewview.export", icon="EXPORT")
+        column.operator("fewview.open_report", icon="URL")
+        column.operator("fewview.open_folder", icon="FILE_FOLDER")
+
+
+class FEWVIEW_PT_past_jobs(_Panel, bpy.types.Panel):
+    """Results on the disk"""
+
+    bl_label = "Past Jobs"
+    bl_parent_id = "FEWVIEW_PT_result"
+    bl_options = {"DEFAULT_CLOSED"}
+
+    def draw(self, context: bpy.types.Context) -> None:
+        """Each with a button that brings it into the scene."""
+        found = past_jobs(jobs_parent(context))[:_MOST_PAST_JOBS]
+        for job in found:
+            text = f"{job.folder.name}: {job.job.preset}, {len(job.job.images)} images"
+            self.layout.operator("fewview.import_result", text=text, icon="IMPORT").folder = str(job.folder)
+        if not found:
+            self.layout.label(text="None in the output folder")
+
+
+def draw_environment(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
+    """Whether there is a Python that can reconstruct, and how to get one."""
+    readiness, text = backend_state(context)
+    if readiness is State.READY:
+        layout.label(text="Backend ready", icon="CHECKMARK")
+        _draw_text(layout, context, text)
+    else:
+        layout.label(text="Set up FewView once", icon="INFO")
+        _draw_text(layout, context, text)
+    column = layout.column(align=True)
+    if readiness is State.NOT_READY:
+        _main_button(column, "fewview.install_backend", icon="IMPORT", text="Set Up...")
+    elif readiness is State.UNKNOWN:
+        _main_button(column, "fewview.check_backend", icon="CHECKMARK", text="Check")
+    else:
+        column.operator("fewview.check_backend")
+        column.operator("fewview.install_backend", text="Set Up Again...")
+    column.operator("fewview.copy_install_lines", icon="COPYDOWN")
+
+
+def _draw_running(layout: bpy.types.UILayout, context: bpy.types.Context, job: jobs.RunningJob) -> None:
+    left = seconds_left(job.share, job.elapsed_s)
+    layout.label(text=job.title, icon="TIME")
+    words = stage_words(job.stage) if job.stage else "Starting"
+    layout.progress(factor=job.share, text=f"{words}  {job.share:.0%}", type="BAR")
+    row = layout.row()
+    row.label(text=job.text)
+    if job.cancelling:
+        layout.label(text="Stopping...")
+    elif left is not None:
+        layout.label(text=f"About {time_words(left)} left")
+    if job.silent_s > _SILENCE_S:
+        _draw_text(layout, context, f"No sign of life for {time_words(job.silent_s)}")
+    for text in job.warnings[-2:]:
+        _draw_text(layout, context, text, icon="ERROR")
+    row = layout.row(align=True)
+    row.operator("fewview.cancel", icon="CANCEL")
+    row.operator("fewview.show_log", icon="TEXT")
+
+
+def _draw_ended(layout: bpy.types.UILayout, context: bpy.types.Context, end: jobs.EndedJob) -> None:
+    """What went wrong, or what the user should know."""
+    row = layout.row()
+    if end.cancelled:
+        row.label(text=f"{end.title} was cancelled", icon="CANCEL")
+    elif end.failure is not None:
+        row.label(text=f"{end.title} failed", icon="ERROR")
+    else:
+        row.label(text=f"{end.title} is done", icon="INFO")
+    row.operator("fewview.dismiss", icon="X", text="", emboss=False)
+    if end.failure is not None and not end.cancelled:
+        _draw_text(layout, context, end.failure.text.partition("\n")[0])
+        _draw_text(layout, context, end.failure.remedy, icon="FORWARD")
+    for text in end.warnings[:3]:
+        _draw_text(layout, context, text, icon="ERROR")
+    if end.failure is not None and not end.cancelled:
+        row = layout.row(align=True)
+        row.operator("fewview.show_log", icon="TEXT")
+        row.operator("fewview.copy_report", icon="COPYDOWN")
+
+
+def _draw_render(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
+    settings = settings_of(context)
+    column = layout.column()
+    column.use_property_split = True
+    column.use_property_decorate = False
+    column.prop(settings, "target", placeholder="Active Object")
+    column.prop(settings, "view_cameras")
+    if settings.view_cameras == "GENERATED":
+        column.prop(settings, "layout")
+        column.prop(settings, "view_count")
+        if settings.layout == "ARC":
+            column.prop(settings, "arc")
+        if settings.layout != "HEMISPHERE":
+            column.prop(settings, "elevation")
+        layout.operator("fewview.generate_views", icon="OUTLINER_OB_CAMERA")
+    elif settings.view_cameras == "ANIMATED":
+        column.prop(settings, "frame_step")
+    _main_button(layout, "fewview.render_views", icon="RENDER_STILL", text="Render Views")
+
+
+class FEWVIEW_PT_render(_Panel, bpy.types.Panel):
+    """Rarely needed settings of rendered views"""
+
+    bl_label = "Render Settings"
+    bl_parent_id = "FEWVIEW_PT_images"
+    bl_options = {"DEFAULT_CLOSED"}
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        """Only for rendered views."""
+        return settings_of(context).source == "RENDER"
+
+    def draw(self, context: bpy.types.Context) -> None:
+        """Picture and cameras."""
+        layout, settings = self.layout, settings_of(context)
+        layout.use_property_split = True
+        layout.use_property_decorate = False
+        column = layout.column(align=True)
+        column.prop(settings, "resolution_x")
+        column.prop(settings, "resolution_y")
+        layout.prop(settings, "engine")
+        if settings.engine == "CYCLES":
+            layout.prop(settings, "samples")
+        if settings.view_cameras == "GENERATED":
+            for name in ("lens_mm", "radius", "azimuth", "jitter", "view_seed"):
+                layout.prop(settings, name)
+
+
+def _draw_list(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
+    settings = settings_of(context)
+    row = layout.row()
+    row.template_list("FEWVIEW_UL_images", "", settings, "images", settings, "active_image", rows=4)
+    column = row.column(align=True)
+    column.operator("fewview.add_images", icon="ADD", text="")
+    column.operator("fewview.remove_image", icon="REMOVE", text="")
+    column.separator()
+    column.operator("fewview.clear_images", icon="TRASH", text="")
+    if 0 <= settings.active_image < len(settings.images):
+        problem = settings.images[settings.active_image].problem
+        if problem:
+            _draw_text(layout, context, problem, icon="ERROR")
+    for problem in list_problems(settings):
+        _draw_text(layout, context, problem, icon="ERROR")
+
+
+def _why_not(context: bpy.types.Context) -> str:
+    """What has to be done before Reconstruct can be pressed; empty where it can."""
+    if jobs.running() is not None:
+        return ""
+    if images_state(settings_of(context)).icon != "CHECKMARK" and not settings_of(context).images:
+        return "Add photographs in step 1 first"
+    return ""
+
+
+def _main_button(layout: bpy.types.UILayout, operator: str, *, icon: str, text: str) -> None:
+    row = layout.row()
+    row.scale_y = _MAIN_SCALE
+    row.operator(operator, icon=icon, text=text)
+
+
+def _draw_state(layout: bpy.types.UILayout, state: StepState) -> None:
+    layout.label(text=state.text, icon=state.icon)
+
+
+def _draw_text(
+    layout: bpy.types.UILayout, context: bpy.types.Context, text: str, *, icon: str = "NONE"
+) -> None:
+    """A sentence in as many lines as the sidebar is narrow."""
+    scale = context.preferences.system.ui_scale
+    width = context.region.width if context.region is not None else 300
+    letters = max(int(width / (_PIXELS_PER_LETTER * scale)) - (8 if icon != "NONE" else 5), 16)
+    column = layout.column(align=True)
+    column.scale_y = 0.8
+    for number, line in enumerate(textwrap.wrap(text, letters) or [""]):
+        column.label(text=line, icon=icon if number == 0 else ("BLANK1" if icon != "NONE" else "NONE"))
+
+
+CLASSES = (
+    FEWVIEW_UL_images,
+    FEWVIEW_PT_main,
+    FEWVIEW_PT_images,
+    FEWVIEW_PT_render,
+    FEWVIEW_PT_cameras,
+    FEWVIEW_PT_region,
+    FEWVIEW_PT_reconstruct,
+    FEWVIEW_PT_advanced,
+    FEWVIEW_PT_result,
+    FEWVIEW_PT_past_jobs,
+)

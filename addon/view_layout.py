@@ -132,11 +132,12 @@ def framing_distance(points: Array, rotation: Array, lens: Lens, *, margin: floa
     return float((in_camera[:, 2:] + np.abs(in_camera[:, :2]) / tangents).max())
 
 
-def place_cameras(layout: ViewLayout, lens: Lens, *, points: Array) -> Array:
+def place_cameras(layout: ViewLayout, lens: Lens, *, points: Array, distance: float | None = None) -> Array:
     """(views, 4, 4): world_from_camera of views around the points (points, 3) that all hold them all.
 
-    They look at the middle of the points' bounding box from one distance. The jitter turns by up to
-    a tenth of the spacing, tilts by up to 3 degrees, rolls by up to 1.5 and steps back by up to
+    They look at the middle of the points' bounding box from one distance: the smallest that holds all
+    points in all views, or the one that is given, where nothing is held for sure. The jitter turns by up
+    to a tenth of the spacing, tilts by up to 3 degrees, rolls by up to 1.5 and steps back by up to
     6 percent: never closer, so nothing leaves the frame.
     """
     rng = np.random.default_rng(layout.seed)
@@ -152,6 +153,7 @@ def place_cameras(layout: ViewLayout, lens: Lens, *, points: Array) -> Array:
             for unit, roll in zip(towards, wobble[:, 3], strict=True)
         ]
     )
-    distance = max(framing_distance(points - centre, pose[:3, :3], lens) for pose in poses)
+    if distance is None:
+        distance = max(framing_distance(points - centre, pose[:3, :3], lens) for pose in poses)
     poses[:, :3, 3] = centre + distance * (1.0 + 0.06 * np.abs(wobble[:, 2:3])) * towards
     return poses

@@ -1,13 +1,19 @@
-"""The command line: python -m backend reconstruct | doctor | rehearse."""
+"""The command line: python -m backend reconstruct | doctor | install | rehearse."""
 
 import argparse
 import faulthandler
 import logging
+import math
 import sys
 from pathlib import Path
+from typing import Any
 
+from . import doctor
+from .commands import install
+from .commands.doctor import doctor_on_wire
 from .commands.reconstruct import EXIT_FINE, EXIT_USER_ERROR, on_terminal, on_wire
 from .commands.rehearse import rehearse
+from .wire.environment import BUILDS
 from .wire.protocol import DEVICES, PRESETS, PROTOCOL_VERSION, Job
 
 _JOB_OPTIONS = ("output", "cameras", "masks", "preset", "device", "seed", "truth")
@@ -19,28 +25,59 @@ def main(arguments: list[str] | None = None) -> int:
     logging.basicConfig(level=logging.WARNING, stream=sys.stderr)
     logging.getLogger("backend").setLevel(logging.INFO)
     logging.getLogger().handlers[0].setLevel(logging.WARNING)
+    return run(arguments)
+
+
+def run(arguments: list[str] | None) -> int:
+    """Run a command in a process that is set up; the exit code."""
     parser = _parser()
     parsed = parser.parse_args(arguments)
     if parsed.command == "doctor":
-        return _doctor(as_json=parsed.json)
+        return _doctor(as_json=parsed.json, on_wire=parsed.wire)
+    if parsed.command == "install":
+        return _install(parsed)
     if parsed.command == "rehearse":
-        return rehearse(parsed.output)
+        return rehearse(parsed.output, seconds=parsed.seconds, end=parsed.end)
+    return _reconstruct(parser, parsed)
+
+
+def _reconstruct(parser: argparse.ArgumentParser, parsed: argparse.Namespace) -> int:
     given = {name: value for name in _JOB_OPTIONS if (value := getattr(parsed, name)) is not None}
+    region: dict[str, Any] = {}
+    if parsed.region is not None:
+        *centre, radius = parsed.region
+        if radius <= 0:
+            parser.error("--region: the radius must be positive")
+        region = {"region_centre": tuple(centre), "region_radius": radius}
     if len(parsed.images) == 1 and parsed.images[0].endswith(".json"):
-        if given:
-            parser.error(f"with a job file, {', '.join('--' + name for name in given)} stands in the file")
+        options = [*given, *(["region"] if region else [])]
+        if options:
+            parser.error(f"with a job file, {', '.join('--' + name for name in options)} stands in the file")
         return on_wire(Path(parsed.images[0]))
     if "output" not in given:
         parser.error("--output is needed")
-    return on_terminal(Job(protocol=PROTOCOL_VERSION, images=tuple(parsed.images), **given))
+    return on_terminal(Job(protocol=PROTOCOL_VERSION, images=tuple(parsed.images), **given, **region))
 
 
-def _doctor(*, as_json: bool) -> int:
-    from . import doctor  # loads every package, which takes seconds
-
-    checks = doctor.examine()
+def _doctor(*, as_json: bool, on_wire: bool) -> int:
+    if on_wire:
+        return doctor_on_wire()
+    checks = tuple(doctor.examine())
     sys.stdout.write((doctor.as_json if as_json else doctor.as_text)(checks) + "\n")
     return EXIT_FINE if doctor.is_ready(checks) else EXIT_USER_ERROR
+
+
+def _install(parsed: argparse.Namespace) -> int:
+    if parsed.remove:
+        return install.remove(parsed.folder)
+    return install.install(
+        install.Plan(
+            folder=parsed.folder,
+            build=parsed.torch,
+            again=parsed.again,
+            requirements_file=parsed.requirements,
+        )
+    )
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -60,11 +97,32 @@ def _parser() -> argparse.ArgumentParser:
     add("--device", choices=DEVICES, help="where to compute (auto: the fastest there is)")
     add("--seed", type=_seed, metavar="N", help="of all chance (0)")
     add("--truth", metavar="MESH", help="true mesh to measure the result against")
-    doctor = commands.add_parser("doctor", help="check that everything needed is there")
-    doctor.add_argument("--json", action="store_true", help="for programs")
+    add(
+        "--region",
+        nargs=4,
+        type=_number,
+        metavar=("X", "Y", "Z", "RADIUS"),
+        help="sphere to reconstruct, in the frame of the cameras; else it is found",
+    )
+    check = commands.add_parser("doctor", help="check that everything needed is there")
+    form = check.add_mutually_exclusive_group()
+    form.add_argument("--json", action="store_true", help="for programs")
+    form.add_argument("--wire", action="store_true", help="for the add-on: each check as it is made")
+    _add_install(commands.add_parser("install", help="make an environment with everything needed"))
     rehearsal = commands.add_parser("rehearse", help="play a run's messages without running it")
     rehearsal.add_argument("--output", metavar="DIR", type=Path, help="new folder for a toy mesh")
+    rehearsal.add_argument("--seconds", metavar="S", type=_number, default=1.0, help="how long it takes (1)")
+    rehearsal.add_argument("--end", choices=("finished", "failed", "crashed"), default="finished")
     return parser
+
+
+def _add_install(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument
+    add("--folder", metavar="DIR", type=Path, required=True, help="where the environment is to be")
+    add("--torch", choices=BUILDS, default="default", help="build of torch (default: the package index's)")
+    add("--again", action="store_true", help="replace an environment that is ready")
+    add("--remove", action="store_true", help="remove the environment instead")
+    add("--requirements", metavar="FILE", type=Path, help=argparse.SUPPRESS)
 
 
 def _seed(text: str) -> int:
@@ -72,6 +130,13 @@ def _seed(text: str) -> int:
     if not 0 <= seed < 2**31:
         raise argparse.ArgumentTypeError("must be from 0 to 2147483647")
     return seed
+
+
+def _number(text: str) -> float:
+    number = float(text)
+    if not math.isfinite(number):
+        raise argparse.ArgumentTypeError("must be a finite number")
+    return number
 
 
 if __name__ == "__main__":

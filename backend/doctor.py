@@ -4,11 +4,14 @@ import importlib
 import json
 import platform
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from importlib.metadata import PackageNotFoundError, version
 
+from .errors import ErrorCode, ReconstructionError
+
 MIN_PYTHON = (3, 11)
+_PYTHON = "Python"
 DEPENDENCIES = {
     # pillow stands before pycolmap: imported the other way round, the two corrupt memory.
     "numpy": "numpy",
@@ -38,20 +41,37 @@ class Check:
     """A version, a device or what is wrong."""
 
 
-def examine() -> tuple[Check, ...]:
-    """All checks: Python, each package, and, where torch loads, each device with a tiny computation."""
-    checks = [_check_python(), *(_check_package(name, pip) for name, pip in DEPENDENCIES.items())]
-    if all(check.fine for check in checks):
-        checks += _check_devices()
-    return tuple(checks)
+def examine() -> Iterator[Check]:
+    """Each check as it is made: Python, the packages, and, where all load, each device by a computation."""
+    checks = [_check_python()]
+    yield checks[0]
+    for module, distribution in DEPENDENCIES.items():
+        checks.append(_check_package(module, distribution))
+        yield checks[-1]
+    if is_ready(checks):
+        yield from _check_devices()
 
 
-def is_ready(checks: tuple[Check, ...]) -> bool:
+def is_ready(checks: Sequence[Check]) -> bool:
     """Whether a reconstruction can start here."""
     return all(check.fine for check in checks)
 
 
-def as_text(checks: tuple[Check, ...]) -> str:
+def not_ready(checks: Sequence[Check]) -> ReconstructionError:
+    """What is wrong, where something is: the first thing in full, the others by name."""
+    first, *others = (check for check in checks if not check.fine)
+    packages = [check.name for check in (first, *others) if check.name in DEPENDENCIES.values()]
+    more = f"; also {', '.join(check.name for check in others)}" if others else ""
+    is_device = not packages and first.name != _PYTHON
+    by_hand = f"; by hand: `{sys.executable} -m pip install {' '.join(packages)}`" if packages else ""
+    return ReconstructionError(
+        ErrorCode.DEVICE_UNAVAILABLE if is_device else ErrorCode.MISSING_DEPENDENCY,
+        f"This Python can not reconstruct: {first.name} ({first.found}){more}.",
+        f"Choose another Python, or have the add-on install one{by_hand}.",
+    )
+
+
+def as_text(checks: Sequence[Check]) -> str:
     """The checks for a person."""
     width = max(len(check.name) for check in checks)
     lines = [f"{'ok ' if check.fine else 'NOT'} {check.name:<{width}} {check.found}" for check in checks]
@@ -61,7 +81,7 @@ def as_text(checks: tuple[Check, ...]) -> str:
     return "\n".join([*lines, remedy])
 
 
-def as_json(checks: tuple[Check, ...]) -> str:
+def as_json(checks: Sequence[Check]) -> str:
     """The checks for a program."""
     return json.dumps({"ready": is_ready(checks), "checks": [asdict(check) for check in checks]})
 
@@ -69,7 +89,7 @@ def as_json(checks: tuple[Check, ...]) -> str:
 def _check_python() -> Check:
     fine = sys.version_info[:2] >= MIN_PYTHON
     needed = "" if fine else f", at least {'.'.join(map(str, MIN_PYTHON))} is needed"
-    return Check(name="Python", fine=fine, found=platform.python_version() + needed)
+    return Check(name=_PYTHON, fine=fine, found=platform.python_version() + needed)
 
 
 def _check_package(module: str, distribution: str) -> Check:
@@ -84,10 +104,11 @@ def _check_package(module: str, distribution: str) -> Check:
         return Check(name=distribution, fine=True, found="version unknown")
 
 
-def _check_devices() -> list[Check]:
+def _check_devices() -> Iterator[Check]:
     from .machine import available_devices
 
-    return [_check_device(kind, name) for kind, name in available_devices().items()]
+    for kind, name in available_devices().items():
+        yield _check_device(kind, name)
 
 
 def _check_device(kind: str, name: str, solve: Callable[[str], float] | None = None) -> Check:

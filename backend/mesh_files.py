@@ -10,7 +10,7 @@ import struct
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float, UInt8, UInt16
+from jaxtyping import Float, Float64, UInt8, UInt16
 
 from .scene import Region, SurfaceMesh, SurfacePoints, transform_points
 
@@ -18,6 +18,7 @@ _POINT_FIELDS = [(axis, "<f8") for axis in ("x", "y", "z")] + [(axis, "<f4") for
 _COLOUR_FIELDS = [(channel, "u1") for channel in ("red", "green", "blue")]
 _MESH_VERTEX = np.dtype([*_POINT_FIELDS, *_COLOUR_FIELDS, ("support", "<f4")])
 _CLOUD_VERTEX = np.dtype([*_POINT_FIELDS, *_COLOUR_FIELDS, ("confidence", "<f4")])
+_SPARSE_VERTEX = np.dtype([*_POINT_FIELDS[:3], *_COLOUR_FIELDS])
 _FACE = np.dtype([("num_corners", "u1"), ("corners", "<i4", (3,))])
 _PLY_NAMES = {"<f8": "double", "<f4": "float", "|u1": "uchar"}
 
@@ -71,6 +72,18 @@ def write_points(path: Path, points: SurfacePoints, region: Region) -> None:
         np.round(points.colours_srgb.clip(0.0, 1.0) * 255).astype(np.uint8),
     )
     table["confidence"] = points.confidence
+    path.write_bytes(_header(table, num_faces=None) + table.tobytes())
+
+
+def write_sparse(
+    path: Path, *, positions: Float64[np.ndarray, "points 3"], colours_srgb: UInt8[np.ndarray, "points 3"]
+) -> None:
+    """Write sparse.ply: the features that photographs share, world frame, with colours; there may be none."""
+    table = np.zeros(len(positions), _SPARSE_VERTEX)
+    for column, (name, _) in enumerate(_POINT_FIELDS[:3]):
+        table[name] = positions[:, column]
+    for column, (name, _) in enumerate(_COLOUR_FIELDS):
+        table[name] = colours_srgb[:, column]
     path.write_bytes(_header(table, num_faces=None) + table.tobytes())
 
 

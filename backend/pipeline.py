@@ -5,7 +5,6 @@ depends on: the inputs' content, its settings and those of the stages before it,
 device and the code. The same fingerprint means that the result can be taken from the last run.
 """
 
-import json
 import logging
 import platform
 import time
@@ -21,30 +20,25 @@ import torch
 
 from .machine import choose_device, peak_memory_bytes, set_up_torch
 from .maths.metrics import load_truth
-from .mesh_files import write_glb, write_mesh, write_points
 from .presets import Settings
+from .previews import Previews
+from .results import cameras_summary, summary, write_all, write_cameras
 from .scene import Decision, Photo, Region, SolvedCameras, SurfaceMesh
 from .stages.cameras import solve_cameras
 from .stages.mesh import extract_mesh
-from .stages.nerfstudio import transforms_json
 from .stages.photos import load_photos
 from .stages.region import find_region
-from .stages.report import (
-    Report,
-    ReportInputs,
-    StageTiming,
-    build_report,
-    render_report_html,
-    report_numbers,
-)
+from .stages.report import Report, ReportInputs, StageTiming, build_report
 from .stages.stereo import StereoResult, match_views
 from .stages.train import Surface, fit_surface
 from .version import VERSION
-from .workspace import LOG, StageCost, Workspace, check_free_space, fingerprint
+from .workspace import StageCost, Workspace, check_free_space, fingerprint
 
 T = typing.TypeVar("T")
 CHECKPOINTED = ("photos", "cameras", "region", "stereo", "train", "mesh")
 STAGE_NAMES = (*CHECKPOINTED, "report")
+_UNTIL = {"cameras": ("photos", "cameras", "region"), "report": STAGE_NAMES}
+"""The stages of a run, by what it is asked for."""
 _CAMERA_FILES = frozenset({".json", ".txt", ".bin"})
 _BYTES_PER_PHOTO = 60_000_000
 """On disk while a run goes on: the photograph, its undistorted twin, depth and normals, as floats."""
@@ -67,6 +61,8 @@ class Job:
     seed: int = 0
     truth: Path | None = None
     """A mesh to measure the result against."""
+    until: str = "report"
+    """"cameras" to end when cameras and region are known; a later run of the whole goes on from there."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -127,6 +123,7 @@ class _Run:
     workspace: Workspace
     listener: Listener
     fingerprints: dict[str, str]
+    stage_names: tuple[str, ...]
     costs: dict[str, StageCost] = field(default_factory=dict)
     warnings: list[str] = field(default_factory=list)
 
@@ -167,7 +164,7 @@ class _Run:
         )
 
     def _start(self, name: str) -> None:
-        self.listener.stage_started(name, STAGE_NAMES.index(name) + 1, len(STAGE_NAMES))
+        self.listener.stage_started(name, self.stage_names.index(name) + 1, len(self.stage_names))
 
     def _measured(self, work: "partial[T]") -> tuple[T, StageCost]:
         self.listener.progressed(0.0, "")
@@ -188,29 +185,53 @@ def run(job: Job, workspace: Workspace, *, settings: Settings, stages: Stages, l
     device = choose_device(job.device)
     set_up_torch(device)
     fingerprints = stage_fingerprints(job, settings, device.type)
-    finished = _finished(workspace, fingerprints)
+    names = _UNTIL[job.until]
+    finished = _finished(workspace, fingerprints, names)
     if finished:
         listener.resumed(finished)
     check_free_space(workspace.folder, _needed_bytes(job))
-    this = _Run(workspace=workspace, listener=listener, fingerprints=fingerprints)
+    this = _Run(workspace=workspace, listener=listener, fingerprints=fingerprints, stage_names=names)
+    solved, region = _placed(job, this, settings, stages)
+    if job.until == "cameras":
+        files = write_cameras(solved, region, workspace)
+        return Outcome(files=files, summary=cameras_summary(solved))
+    inputs = _reconstructed(job, this, settings, stages, placed=(solved, region, device))
+    report = this.unkept_stage("report", partial(stages.build_report, inputs, settings.report))
+    return Outcome(files=write_all(report, workspace), summary=summary(report))
 
+
+def _placed(job: Job, this: _Run, settings: Settings, stages: Stages) -> tuple[SolvedCameras, Region]:
+    """Where each photograph was taken, and what of the world is to be reconstructed."""
     photos = this.stage("photos", partial(stages.load_photos, job.images, job.masks, settings.photos))
-    scratch = {"workdir": workspace.emptied_sfm_folder(), "seed": job.seed}
+    scratch = {"workdir": this.workspace.emptied_sfm_folder(), "seed": job.seed}
     solve = partial(stages.solve_cameras, photos, job.cameras, settings.cameras, **scratch)
     solved = this.stage("cameras", solve)
     _warn_of_unplaced(solved, len(photos), this)
     del photos, solve  # the views hold what is needed of them
-    region = this.stage("region", partial(stages.find_region, solved, settings.region))
+    return solved, this.stage("region", partial(stages.find_region, solved, settings.region))
+
+
+def _reconstructed(
+    job: Job,
+    this: _Run,
+    settings: Settings,
+    stages: Stages,
+    *,
+    placed: tuple[SolvedCameras, Region, torch.device],
+) -> ReportInputs:
+    """The mesh, with all that the report tells of it."""
+    solved, region, device = placed
     views = solved.views
+    previews = Previews(this.workspace, this.listener.previewed)
     stereo = this.stage("stereo", partial(stages.match_views, views, region, settings.stereo, device=device))
-    write_points(workspace.preview_path, stereo.points, region)
-    listener.previewed(workspace.preview_path)
+    previews.show_points(stereo.points, region)
     chance = {"device": device, "generator": torch.Generator(device).manual_seed(job.seed)}
-    fit = partial(stages.fit_surface, views, region, stereo, settings.train, **chance)
+    show = partial(previews.show_surface, points=stereo.points, region=region)
+    fit = partial(stages.fit_surface, views, region, stereo, settings.train, show=show, **chance)
     surface = this.stage("train", fit)
     extract = partial(stages.extract_mesh, views, region, stereo, surface, settings.mesh)
     mesh = this.stage("mesh", extract)
-    inputs = ReportInputs(
+    return ReportInputs(
         job_name=job.output.resolve().name,
         settings=settings,
         seed=job.seed,
@@ -224,8 +245,6 @@ def run(job: Job, workspace: Workspace, *, settings: Settings, stages: Stages, l
         truth=job.truth,
         versions=_versions(),
     )
-    report = this.unkept_stage("report", partial(stages.build_report, inputs, settings.report))
-    return Outcome(files=_write(report, workspace), summary=_summary(report))
 
 
 def stage_fingerprints(job: Job, settings: Settings, device_kind: str) -> dict[str, str]:
@@ -253,9 +272,10 @@ def code_fingerprint() -> str:
     return fingerprint(*sorted(sources))
 
 
-def _finished(workspace: Workspace, fingerprints: dict[str, str]) -> tuple[str, ...]:
-    """The stages, from the first one on, that need not be done again."""
-    return tuple(takewhile(lambda name: workspace.is_finished(name, fingerprints[name]), CHECKPOINTED))
+def _finished(workspace: Workspace, fingerprints: dict[str, str], names: tuple[str, ...]) -> tuple[str, ...]:
+    """Those of the stages, from the first one on, that need not be done again."""
+    kept = (name for name in names if name in CHECKPOINTED)
+    return tuple(takewhile(lambda name: workspace.is_finished(name, fingerprints[name]), kept))
 
 
 def _camera_files(cameras: Path | None) -> list[Path | str]:
@@ -273,7 +293,7 @@ def _needed_bytes(job: Job) -> int:
 
 def _warn_of_unplaced(solved: SolvedCameras, num_photos: int, this: _Run) -> None:
     if solved.unplaced:
-        names = ", ".join(solved.unplaced)
+        names = "; ".join(f"{photo.name} ({photo.why})" for photo in solved.unplaced)
         this.warn(f"{len(solved.unplaced)} of {num_photos} photographs could not be placed: {names}.")
 
 
@@ -287,46 +307,3 @@ def _versions() -> dict[str, str]:
     """What the result depends on, with versions."""
     packages = ("torch", "pycolmap", "scikit-image", "numpy")
     return {"FewView": VERSION, "Python": platform.python_version(), **{n: version(n) for n in packages}}
-
-
-def _write(report: Report, workspace: Workspace) -> tuple[str, ...]:
-    """Put all results in place; their names."""
-    inputs = report.inputs
-    numbers = _json(report_numbers(report))
-    page = render_report_html(report)
-    cameras = _json(transforms_json(inputs.solved))
-    writers: dict[str, Callable[[Path], object]] = {
-        "mesh.ply": partial(write_mesh, mesh=inputs.mesh),
-        "mesh.glb": partial(write_glb, mesh=inputs.mesh),
-        "points.ply": partial(write_points, points=inputs.points, region=inputs.region),
-        "cameras.json": lambda path: path.write_text(cameras, encoding="utf-8"),
-        "report.json": lambda path: path.write_text(numbers, encoding="utf-8"),
-        "report.html": lambda path: path.write_text(page, encoding="utf-8"),
-    }
-    workspace.write_results(writers)
-    return (*writers, LOG)
-
-
-def _json(content: dict[str, object]) -> str:
-    return json.dumps(content, indent=2, allow_nan=False) + "\n"
-
-
-def _summary(report: Report) -> tuple[str, ...]:
-    """The result in a few lines."""
-    mesh = report.mesh
-    closed = "closed" if mesh.watertight else "open"
-    lines = [
-        f"{mesh.num_faces} triangles, {closed}; {mesh.measured_share:.0%} of the surface measured, "
-        f"{mesh.guessed_share:.0%} guessed; {report.total_seconds:.0f} s of computing"
-    ]
-    if report.mean_psnr_db is not None:
-        lines.append(f"PSNR against the photographs: {report.mean_psnr_db:.1f} dB")
-    if report.error is not None:
-        parts = {"the whole truth": report.error.whole, "its visible part": report.error.visible}
-        lines += [
-            f"Error against {name}: Chamfer {part.chamfer_percent:.3f} % of the diagonal, "
-            f"F-score at 1 %: {part.f_score_at_one_percent:.3f}"
-            for name, part in parts.items()
-            if part is not None
-        ]
-    return tuple(lines)

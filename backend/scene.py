@@ -97,12 +97,34 @@ class View:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Lens:
+    """The lens that took a photograph, over the photograph's original, upright size."""
+
+    model: str
+    """Name of a projection model of COLMAP."""
+    width: int
+    height: int
+    params: tuple[float, ...]
+    """In COLMAP's order for the model; lengths in pixels of the original size."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Unplaced:
+    """A photograph without a camera."""
+
+    name: str
+    why: str
+    """For a person: a phrase that may follow the name, without a full stop."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class SolvedCameras:
     """What the camera stage found."""
 
     views: tuple[View, ...]
-    unplaced: tuple[str, ...]
-    """Names of photographs without a camera."""
+    lenses: tuple[Lens, ...]
+    """One for each view: what its photograph was taken with before the distortion was removed."""
+    unplaced: tuple[Unplaced, ...]
     estimated: bool
     """False where the cameras were given."""
     sparse_positions: Float64[np.ndarray, "points 3"]

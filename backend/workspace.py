@@ -62,10 +62,15 @@ class Workspace:
         """Where the log of all runs is."""
         return self.folder / LOG
 
-    @property
-    def preview_path(self) -> Path:
-        """Where the points are to be seen while the surface is not there yet."""
-        return self.private / "preview.ply"
+    def preview_path(self, number: int) -> Path:
+        """Where the run's first, second ... preview is to be seen."""
+        return self.private / f"preview-{number}.ply"
+
+    def remove_previews(self) -> None:
+        """Without those of earlier runs."""
+        for path in self.private.glob("preview*.ply"):
+            with suppress(OSError):  # on Windows somebody may still be looking at it
+                path.unlink()
 
     def emptied_sfm_folder(self) -> Path:
         """Scratch folder for the camera solver, without what a killed run may have left in it."""

@@ -1,7 +1,6 @@
 """The camera, and how Cycles renders what it sees."""
 
 import os
-import struct
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -13,12 +12,10 @@ import numpy as np
 from mathutils import Matrix
 from numpy.typing import NDArray
 
+from addon.png import critical_chunks
 from addon.view_layout import Lens
 
 SENSOR_WIDTH_MM = 36.0
-PNG_SIGNATURE_BYTES = 8
-PNG_CHUNK_FRAME_BYTES = 12
-"""Length, type and checksum around the content of each chunk."""
 
 
 def add_camera(lens: Lens, *, distance: float) -> Any:
@@ -65,21 +62,6 @@ def render_view(path: Path, camera: Any, world_from_camera: NDArray[np.float64],
     with quiet_output():
         bpy.ops.render.render(write_still=True)
     path.write_bytes(critical_chunks(path.read_bytes()))
-
-
-def critical_chunks(png: bytes) -> bytes:
-    """The PNG file without its optional chunks, where Blender writes date and render time.
-
-    A chunk is critical where its type begins with a capital letter (PNG specification, 5.4).
-    """
-    kept, at = [png[:PNG_SIGNATURE_BYTES]], PNG_SIGNATURE_BYTES
-    while at < len(png):
-        length, kind = struct.unpack_from(">I4s", png, at)
-        end = at + length + PNG_CHUNK_FRAME_BYTES
-        if kind[:1].isupper():
-            kept.append(png[at:end])
-        at = end
-    return b"".join(kept)
 
 
 @contextmanager

@@ -1,110 +1,23 @@
 """The true surface of a scene, and what exact cameras see of it."""
 
-from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
-
-import bpy
 import numpy as np
 from mathutils import Vector
 from mathutils.bvhtree import BVHTree
 from numpy.typing import NDArray
 
+from addon.true_mesh import TrueMesh, bounding_sphere, signed_volume, true_mesh, vertex_normals, write_ply
 from addon.view_layout import Lens
 
-FLAT = 1e-6
-"""Volume over the cube of the size, below which a sheet has no inside that could tell its front."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class TrueMesh:
-    """Triangles in the world frame, counter-clockwise seen from outside."""
-
-    vertices: NDArray[np.float64]
-    """(vertices, 3), metres."""
-    normals: NDArray[np.float64]
-    """(vertices, 3), unit."""
-    faces: NDArray[np.int32]
-    """(faces, 3)."""
-
-
-def true_mesh(objects: tuple[Any, ...]) -> TrueMesh:
-    """The objects as they are rendered, all modifiers applied, in one mesh."""
-    bpy.context.view_layer.update()
-    depsgraph = bpy.context.evaluated_depsgraph_get()
-    parts = [_evaluated(made.evaluated_get(depsgraph)) for made in objects]
-    first_vertex = np.cumsum([0] + [len(part.vertices) for part in parts])
-    return TrueMesh(
-        vertices=np.concatenate([part.vertices for part in parts]),
-        normals=np.concatenate([part.normals for part in parts]),
-        faces=np.concatenate(
-            [part.faces + np.int32(first) for part, first in zip(parts, first_vertex, strict=False)]
-        ),
-    )
-
-
-def _evaluated(made: Any) -> TrueMesh:
-    mesh = made.to_mesh()
-    mesh.calc_loop_triangles()
-    vertices = np.empty(len(mesh.vertices) * 3, np.float32)
-    faces = np.empty(len(mesh.loop_triangles) * 3, np.int32)
-    mesh.vertices.foreach_get("co", vertices)
-    mesh.loop_triangles.foreach_get("vertices", faces)
-    made.to_mesh_clear()
-    world_from_object = np.array(made.matrix_world, np.float64)
-    vertices_world = vertices.reshape(-1, 3) @ world_from_object[:3, :3].T + world_from_object[:3, 3]
-    triangles = faces.reshape(-1, 3)
-    if np.linalg.det(world_from_object[:3, :3]) < 0:  # a mirror turns the triangles round
-        triangles = triangles[:, ::-1]
-    extent = np.linalg.norm(np.ptp(vertices_world, axis=0))
-    if signed_volume(vertices_world, triangles) < -FLAT * extent**3:
-        triangles = triangles[:, ::-1]
-    normals = vertex_normals(vertices_world, triangles)
-    return TrueMesh(vertices=vertices_world, normals=normals, faces=triangles)
-
-
-def vertex_normals(vertices: NDArray[np.float64], faces: NDArray[np.int32]) -> NDArray[np.float64]:
-    """(vertices, 3): mean of the triangles' normals by area; 0 where a vertex has no triangle.
-
-    Computed here because Blender's own are those that a file brought, where it brought any.
-    """
-    corners = vertices[faces]
-    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    sums = np.stack(
-        [
-            np.bincount(faces.ravel(), weights=np.repeat(across[:, axis], 3), minlength=len(vertices))
-            for axis in range(3)
-        ],
-        axis=-1,
-    )
-    lengths = np.linalg.norm(sums, axis=1, keepdims=True)
-    normals: NDArray[np.float64] = np.divide(sums, lengths, out=np.zeros_like(sums), where=lengths > 0)
-    return normals
-
-
-def signed_volume(vertices: NDArray[np.float64], faces: NDArray[np.int32]) -> float:
-    """Volume in cubic metres, positive where the triangles face outwards; about the centre where open."""
-    corners = (vertices - vertices.mean(axis=0))[faces]
-    return float(np.einsum("fi,fi->", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])) / 6.0)
-
-
-def bounding_sphere(mesh: TrueMesh) -> tuple[NDArray[np.float64], float]:
-    """Centre of the bounding box and distance of the farthest vertex from it."""
-    centre = (mesh.vertices.min(axis=0) + mesh.vertices.max(axis=0)) / 2
-    return centre, float(np.linalg.norm(mesh.vertices - centre, axis=1).max())
-
-
-def write_ply(path: Path, mesh: TrueMesh) -> None:
-    """Binary PLY with vertex normals; float32 coordinates."""
-    vertex = np.hstack([mesh.vertices, mesh.normals]).astype("<f4")
-    face = np.empty(len(mesh.faces), dtype=[("count", "u1"), ("corners", "<i4", 3)])
-    face["count"], face["corners"] = 3, mesh.faces
-    properties = "".join(f"property float {name}\n" for name in ("x", "y", "z", "nx", "ny", "nz"))
-    header = (
-        f"ply\nformat binary_little_endian 1.0\nelement vertex {len(vertex)}\n{properties}"
-        f"element face {len(face)}\nproperty list uchar int vertex_indices\nend_header\n"
-    )
-    path.write_bytes(header.encode("ascii") + vertex.tobytes() + face.tobytes())
+__all__ = [
+    "TrueMesh",
+    "bounding_sphere",
+    "depth_and_normals",
+    "ray_caster",
+    "signed_volume",
+    "true_mesh",
+    "vertex_normals",
+    "write_ply",
+]
 
 
 def ray_caster(mesh: TrueMesh) -> BVHTree:

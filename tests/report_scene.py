@@ -14,9 +14,11 @@ from backend.scene import (
     SolvedCameras,
     SurfaceMesh,
     SurfacePoints,
+    Unplaced,
     View,
 )
 from backend.stages.report import ReportInputs, StageTiming
+from tests.synthetic_scene import pinhole_lens
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -118,7 +120,8 @@ def finished_run(
         ),
         solved=SolvedCameras(
             views=views,
-            unplaced=("IMG_4030.JPG",),
+            lenses=tuple(pinhole_lens(view.camera) for view in views),
+            unplaced=(Unplaced(name="IMG_4030.JPG", why="it shares no features with the others"),),
             estimated=True,
             sparse_positions=none,
             sparse_visibility=np.zeros((0, num_photos), bool),

@@ -17,7 +17,7 @@ from jaxtyping import Bool, Float32, Float64, Int64
 from PIL import Image
 
 from backend.maths.raycast import RayCaster, camera_rays
-from backend.scene import Camera, Region, SolvedCameras, View
+from backend.scene import Camera, Lens, Region, SolvedCameras, View
 
 CENTRE = np.array([0.7, -0.4, 1.1])
 SIZE = 2.5
@@ -57,12 +57,19 @@ class Scene:
         sparse = np.zeros((0, 3)) if sparse is None else sparse
         return SolvedCameras(
             views=self.views,
+            lenses=tuple(pinhole_lens(camera) for camera in self.cameras),
             unplaced=(),
             estimated=False,
             sparse_positions=sparse,
             sparse_visibility=np.ones((len(sparse), len(self.views)), bool),
             reprojection_error_px=None,
         )
+
+
+def pinhole_lens(camera: Camera) -> Lens:
+    """The lens of a photograph that is as large as its camera's picture and has no distortion."""
+    params = (camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px)
+    return Lens(model="PINHOLE", width=camera.width, height=camera.height, params=params)
 
 
 def surface_radius(directions: Points) -> Float64[np.ndarray, "points"]:

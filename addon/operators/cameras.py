@@ -1,3 +1,251 @@
-"""cameras."""
+"""Step 2: find the cameras, show them, look through them."""
 
-CLASSES = ()
+from collections.abc import Iterator
+from functools import partial
+from pathlib import Path
+
+import bpy
+from bpy.props import StringProperty
+
+from ...backend.wire.client import backend_command
+from ...backend.wire.protocol import PROTOCOL_VERSION, Job, ProtocolError, decode_job
+from .. import camera_objects, jobs, undo_step
+from ..arguments import argument, fill_in
+from ..job_folder import JOB_FILE, LOG, RESULT, FolderError, new_folder, write_job
+from ..properties import settings_of
+from .environment import backend_python_or_reason
+from .images import used_images
+from .reconstruct import jobs_parent
+
+_LARGEST_JOB_BYTES = 1_000_000
+
+
+class FEWVIEW_OT_estimate_cameras(bpy.types.Operator):
+    """Find where the photographs were taken, or read their known cameras, and show them in the scene"""
+
+    bl_idname = "fewview.estimate_cameras"
+    bl_label = "Find Cameras"
+
+    images: StringProperty(
+        name="Photographs",
+        description="Folder of photographs; those of the list where this is empty",
+        subtype="DIR_PATH",
+        options={"SKIP_SAVE"},
+    )
+    camera_source: argument("camera_source")
+    cameras_path: argument("cameras_path")
+    masks: argument("masks")
+    preset: argument("preset")
+    device: argument("device")
+    seed: argument("seed")
+    output: argument("output")
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        """A backend, and no other job."""
+        if jobs.running() is not None:
+            cls.poll_message_set("Wait for the running job, or cancel it")
+            return False
+        python, reason = backend_python_or_reason(context)
+        if python is None:
+            cls.poll_message_set(reason)
+        return python is not None
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        """Start the backend."""
+        same = ("camera_source", "cameras_path", "masks", "preset", "device", "seed")
+        fill_in(self, settings_of(context), {name: name for name in same})
+        python, reason = backend_python_or_reason(context)
+        try:
+            if python is None:
+                raise ValueError(reason)
+            job = self._job(context)
+            folder = new_folder(jobs_parent(context, self.output), "reconstruct")
+            jobs.start(
+                "Finding cameras",
+                backend_command(python, "reconstruct", str(write_job(folder, job))),
+                folder=folder,
+                log_path=folder / LOG,
+                on_finished=partial(_on_finished, context.scene.name, folder),
+            )
+        except (FolderError, ValueError, OSError, jobs.JobError) as error:
+            self.report({"ERROR"}, str(error))
+            return {"CANCELLED"}
+        return jobs.follow(self)
+
+    def _job(self, context: bpy.types.Context) -> Job:
+        """Raises ValueError where there is nothing to find cameras of."""
+        folder = bpy.path.abspath(self.images)
+        images = (Path(folder).absolute(),) if folder else used_images(settings_of(context))
+        if not images:
+            raise ValueError("There are no photographs: add some in step 1")
+        known = self.camera_source == "KNOWN"
+        if known and not self.cameras_path:
+            raise ValueError("There is no file of known cameras: choose one, or let the cameras be estimated")
+        return Job(
+            protocol=PROTOCOL_VERSION,
+            images=tuple(str(path) for path in images),
+            output=RESULT,
+            cameras=_absolute(self.cameras_path) if known else None,
+            masks=_absolute(self.masks) if self.masks else None,
+            preset=self.preset,
+            device=self.device,
+            seed=self.seed,
+            until="cameras",
+        )
+
+
+class FEWVIEW_OT_import_cameras(bpy.types.Operator):
+    """Show the cameras, photographs and points that a job has found, in place of an earlier import's"""
+
+    bl_idname = "fewview.import_cameras"
+    bl_label = "Import Cameras"
+    bl_options = {"REGISTER", "UNDO"}
+
+    folder: StringProperty(
+        name="Job Folder",
+        description="Folder of the job; that of the last cameras where this is empty",
+        subtype="DIR_PATH",
+        options={"SKIP_SAVE"},
+    )
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        """Import all at once."""
+        chosen = self.folder or settings_of(context).cameras_job
+        try:
+            if not chosen:
+                raise ValueError("There is no job folder: choose one, or find cameras first")
+            warnings: list[str] = []
+            for _ in show_cameras(context.scene.name, Path(_absolute(chosen)), warnings):
+                pass
+        except (ValueError, RuntimeError) as error:
+            self.report({"ERROR"}, f"The cameras cannot be imported: {error}")
+            return {"CANCELLED"}
+        for text in warnings:
+            self.report({"WARNING"}, text)
+        return {"FINISHED"}
+
+
+class FEWVIEW_OT_remove_cameras(bpy.types.Operator):
+    """Remove the imported cameras and points; photographs, meshes and your own objects stay"""
+
+    bl_idname = "fewview.remove_cameras"
+    bl_label = "Remove Cameras"
+    bl_options = {"REGISTER", "UNDO"}
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        """There must be some."""
+        if not camera_objects.jobs_of(context.scene):
+            cls.poll_message_set("There are no imported cameras")
+            return False
+        return True
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        """Remove those of all jobs."""
+        for job in camera_objects.jobs_of(context.scene):
+            camera_objects.remove(context.scene, job)
+        return {"FINISHED"}
+
+
+class FEWVIEW_OT_show_photograph(bpy.types.Operator):
+    """Look through the camera of a photograph; the scene's resolution becomes the photograph's"""
+
+    bl_idname = "fewview.show_photograph"
+    bl_label = "Show Photograph"
+    bl_options = {"REGISTER", "UNDO"}
+
+    photograph: StringProperty(
+        name="Photograph",
+        description="Its file name; the active one of the list where this is empty",
+        options={"SKIP_SAVE"},
+    )
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        """There must be cameras to look through."""
+        if not camera_objects.cameras_with_photographs(context.scene):
+            cls.poll_message_set("Find the cameras first")
+            return False
+        return True
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        """Make it the scene's camera and turn the viewport to it."""
+        scene, settings = context.scene, settings_of(context)
+        name = self.photograph
+        if not name and 0 <= settings.active_image < len(settings.images):
+            name = Path(settings.images[settings.active_image].path).name
+        camera = camera_objects.camera_of_photograph(scene, name)
+        if camera is None:
+            missing = f"{name} has no camera: choose another photograph" if name else "Choose a photograph"
+            self.report({"ERROR"}, missing)
+            return {"CANCELLED"}
+        scene.camera = camera
+        width, height = camera.get(camera_objects.SIZE, (0, 0))
+        if width and height:
+            scene.render.resolution_x, scene.render.resolution_y = int(width), int(height)
+            scene.render.resolution_percentage = 100
+        _look_through(context)
+        return {"FINISHED"}
+
+
+def show_cameras(scene_name: str, folder: Path, warnings: list[str]) -> Iterator[None]:
+    """Import a job's cameras in steps for a timer; what the user should know is added to the warnings.
+
+    Pushes no undo step. Raises ValueError for files that cannot be used.
+    """
+    wanted = camera_objects.read_import(folder, _photographs(folder, scene_name))
+    yield
+    yield from camera_objects.import_steps(scene_name, wanted)
+    settings = bpy.data.scenes[scene_name].fewview
+    settings.cameras_job = str(folder)
+    reasons = dict(wanted.solved.unplaced)
+    for image in settings.images:
+        name = Path(bpy.path.abspath(image.path)).name
+        if name in reasons:
+            image.problem = reasons[name]
+    warnings += [f"{name} could not be placed: {why}" for name, why in wanted.solved.unplaced]
+    warnings += camera_objects.problems(wanted)
+
+
+def _on_finished(scene_name: str, folder: Path, _: object) -> Iterator[None]:
+    warnings: list[str] = []
+    yield from show_cameras(scene_name, folder, warnings)
+    job = jobs.running()
+    if job is not None:
+        job.warnings += [text for text in warnings if text not in job.warnings]
+    undo_step.push("Find Cameras")
+
+
+def _photographs(folder: Path, scene_name: str) -> tuple[Path, ...]:
+    """The job's photographs, or those of the list where the job's file does not say."""
+    path = folder / JOB_FILE
+    try:
+        if path.stat().st_size <= _LARGEST_JOB_BYTES:
+            images = decode_job(path.read_text(encoding="utf-8")).images
+            return tuple(folder / image for image in images)
+    except (OSError, UnicodeDecodeError, ProtocolError):
+        pass
+    return used_images(bpy.data.scenes[scene_name].fewview)
+
+
+def _absolute(path: str) -> str:
+    return str(Path(bpy.path.abspath(path)).absolute())
+
+
+def _look_through(context: bpy.types.Context) -> None:
+    """Turn the viewport that was clicked in, or else every viewport of the window, to the scene's camera."""
+    areas = [context.area] if context.area is not None else []
+    if not areas or areas[0].type != "VIEW_3D":
+        areas = list(context.screen.areas) if context.screen is not None else []
+    for area in areas:
+        if area.type == "VIEW_3D" and area.spaces.active.region_3d is not None:
+            area.spaces.active.region_3d.view_perspective = "CAMERA"
+
+
+CLASSES = (
+    FEWVIEW_OT_estimate_cameras,
+    FEWVIEW_OT_import_cameras,
+    FEWVIEW_OT_remove_cameras,
+    FEWVIEW_OT_show_photograph,
+)

@@ -1,3 +1,263 @@
-"""reconstruct."""
+"""Step 4: start, cancel, and what the job says."""
 
-CLASSES = ()
+from collections.abc import Sequence
+from pathlib import Path
+
+import bpy
+from bpy.props import FloatVectorProperty, StringProperty
+
+from ...backend.wire.client import backend_command
+from ...backend.wire.protocol import PROTOCOL_VERSION, Finished, Job
+from .. import jobs
+from ..arguments import argument, fill_in
+from ..frames import world_from_solved_or_none
+from ..job_folder import CAMERAS, LOG, RESULT, PastJob, new_folder, write_job
+from ..mesh_import import MeshImport, remove_preview, scene_named, show_preview
+from ..preferences import preferences_of
+from ..properties import FEWVIEW_PG_settings, settings_of
+from ..region import region_of
+from ..report_text import report_text
+from ..result_import import import_result_steps
+from ..solved import read_solved
+from .environment import backend_python_or_reason
+from .images import used_images
+
+FEWEST_IMAGES = 2
+
+
+def jobs_parent(context: bpy.types.Context, given: str = "") -> Path:
+    """Folder in which jobs get folders of their own.
+
+    In this order: given, the scene's, beside the .blend, the preferences'.
+    """
+    chosen = given or settings_of(context).output
+    if chosen:
+        return Path(bpy.path.abspath(chosen)).absolute()
+    if bpy.data.filepath:
+        return Path(bpy.data.filepath).parent / "fewview"
+    return Path(preferences_of(context).output).expanduser().absolute()
+
+
+def cameras_for(settings: FEWVIEW_PG_settings, images: Sequence[Path]) -> str | None:
+    """The cameras file of the job: given, or found in step 2; None to find them now.
+
+    Raises ValueError where the list has changed since they were found.
+    """
+    if settings.camera_source == "KNOWN":
+        if not settings.cameras_path:
+            raise ValueError("No file with known cameras is chosen: choose one in step 2, or Estimate")
+        return _absolute(settings.cameras_path)
+    if not settings.cameras_job:
+        return None
+    path = Path(bpy.path.abspath(settings.cameras_job)) / RESULT / CAMERAS
+    try:
+        solved = read_solved(path)
+    except (ValueError, OSError):
+        return None  # the user has moved or removed it: they are found again
+    known = {camera.name for camera in solved.cameras} | {name for name, _ in solved.unplaced}
+    if {path.name for path in images} <= known:
+        return str(path)
+    raise ValueError("Photographs were added since the cameras were estimated: estimate them again in step 2")
+
+
+class FEWVIEW_OT_reconstruct(bpy.types.Operator):
+    """Make a mesh from the photographs; Blender stays usable meanwhile"""
+
+    bl_idname = "fewview.reconstruct"
+    bl_label = "Reconstruct"
+    bl_options = {"REGISTER"}
+
+    images: StringProperty(
+        name="Images",
+        description="Folders or files, one a line; the list of the panel where this is empty",
+        options={"SKIP_SAVE"},
+    )
+    cameras: StringProperty(
+        name="Cameras",
+        description="File or folder of known cameras; as step 2 says where this is empty",
+        options={"SKIP_SAVE"},
+    )
+    masks: argument("masks")
+    preset: argument("preset")
+    device: argument("device")
+    seed: argument("seed")
+    truth: argument("truth")
+    output: argument("output")
+    region: FloatVectorProperty(
+        name="Region",
+        description="Centre and radius of what is reconstructed, in the frame of the cameras",
+        size=4,
+        options={"SKIP_SAVE"},
+    )
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        """Not twice at once, and not without a backend."""
+        job = jobs.running()
+        reason = f"{job.title} is still running" if job else backend_python_or_reason(context)[1]
+        if reason:
+            cls.poll_message_set(reason)
+        return not reason
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        """Start; without a window, wait for the end."""
+        same = ("preset", "device", "seed", *(() if self.images else ("masks", "truth")))
+        fill_in(self, settings_of(context), {name: name for name in same})
+        python, reason = backend_python_or_reason(context)
+        try:
+            if python is None:
+                raise ValueError(reason)
+            asked = self._job(context)
+            folder = new_folder(jobs_parent(context, self.output), "reconstruct")
+            start(python, folder, asked, scene_name=context.scene.name)
+        except (ValueError, jobs.JobError, OSError) as error:
+            self.report({"ERROR"}, str(error))
+            return {"CANCELLED"}
+        return jobs.follow(self)
+
+    def _job(self, context: bpy.types.Context) -> Job:
+        """Raises ValueError with the remedy where something is missing."""
+        settings = settings_of(context)
+        if self.images:
+            images = tuple(Path(_absolute(line.strip())) for line in self.images.splitlines() if line.strip())
+        else:
+            images = used_images(settings)
+            if len(images) < FEWEST_IMAGES:
+                raise ValueError("There are too few photographs: add at least three in step 1")
+        cameras = _absolute(self.cameras) if self.cameras else None
+        if cameras is None and not self.images:
+            cameras = cameras_for(settings, images)
+        centre, radius = self._region(context)
+        return Job(
+            protocol=PROTOCOL_VERSION,
+            images=tuple(str(path) for path in images),
+            output=RESULT,
+            cameras=cameras,
+            masks=_absolute(self.masks) if self.masks else None,
+            preset=self.preset,
+            device=self.device,
+            seed=self.seed,
+            truth=_absolute(self.truth) if self.truth else None,
+            region_centre=centre,
+            region_radius=radius,
+        )
+
+    def _region(self, context: bpy.types.Context) -> tuple[tuple[float, ...] | None, float | None]:
+        if self.properties.is_property_set("region"):
+            return tuple(self.region[:3]), self.region[3]
+        sphere = None if self.images else region_of(context.scene)
+        return (None, None) if sphere is None else (tuple(map(float, sphere[0])), float(sphere[1]))
+
+
+def start(python: Path, folder: Path, asked: Job, *, scene_name: str) -> None:
+    """Start the backend on the job in the folder; its mesh comes into the scene at the end.
+
+    Raises JobError where it cannot be started.
+    """
+    path = write_job(folder, asked)
+
+    def on_preview(shown: Path) -> jobs.Steps:
+        job = PastJob(folder=folder, job=asked)
+        frame = world_from_solved_or_none(scene_named(scene_name), job)
+        if frame is not None:
+            wanted = MeshImport(job=str(folder), scene_name=scene_name, world_from_solved=frame)
+            yield from show_preview(shown, wanted)
+
+    def on_finished(_: Finished) -> jobs.Steps:
+        yield from import_result_steps(folder, scene_name=scene_name, undo=not bpy.app.background)
+
+    jobs.start(
+        "Reconstructing",
+        backend_command(python, "reconstruct", str(path)),
+        folder=folder,
+        log_path=folder / LOG,
+        on_finished=on_finished,
+        on_preview=on_preview,
+        on_end=remove_preview,
+    )
+
+
+def _absolute(path: str) -> str:
+    return str(Path(bpy.path.abspath(path)).absolute())
+
+
+class FEWVIEW_OT_cancel(bpy.types.Operator):
+    """Stop the running job; what is finished of it is kept on disk"""
+
+    bl_idname = "fewview.cancel"
+    bl_label = "Cancel"
+
+    @classmethod
+    def poll(cls, _context: bpy.types.Context) -> bool:
+        """Something must run."""
+        job = jobs.running()
+        if job is None or job.cancelling:
+            cls.poll_message_set("Nothing is running" if job is None else "It is stopping already")
+            return False
+        return True
+
+    def execute(self, _context: bpy.types.Context) -> set[str]:
+        """Ask it to stop."""
+        jobs.cancel()
+        jobs.redraw()
+        return {"FINISHED"}
+
+
+class FEWVIEW_OT_show_log(bpy.types.Operator):
+    """Open the log of the last job in a text editor"""
+
+    bl_idname = "fewview.show_log"
+    bl_label = "Show Log"
+
+    @classmethod
+    def poll(cls, _context: bpy.types.Context) -> bool:
+        """There must be one."""
+        if jobs.log_path() is None:
+            cls.poll_message_set("No job has run yet")
+            return False
+        return True
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        """Put the log into a text block, and into a window of its own where there is one."""
+        text = bpy.data.texts.get("FewView Log") or bpy.data.texts.new("FewView Log")
+        text.from_string(report_text(context))
+        if not bpy.app.background:
+            bpy.ops.wm.window_new()
+            area = context.window_manager.windows[-1].screen.areas[0]
+            area.type = "TEXT_EDITOR"
+            area.spaces.active.text = text
+        return {"FINISHED"}
+
+
+class FEWVIEW_OT_copy_report(bpy.types.Operator):
+    """Copy what a developer needs to know about the last job"""
+
+    bl_idname = "fewview.copy_report"
+    bl_label = "Copy Report"
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        """To the clipboard."""
+        context.window_manager.clipboard = report_text(context)
+        self.report({"INFO"}, "The report is on the clipboard")
+        return {"FINISHED"}
+
+
+class FEWVIEW_OT_dismiss(bpy.types.Operator):
+    """Show this no more"""
+
+    bl_idname = "fewview.dismiss"
+    bl_label = "Dismiss"
+
+    def execute(self, _context: bpy.types.Context) -> set[str]:
+        """Forget how the last job ended."""
+        jobs.forget()
+        return {"FINISHED"}
+
+
+CLASSES = (
+    FEWVIEW_OT_reconstruct,
+    FEWVIEW_OT_cancel,
+    FEWVIEW_OT_show_log,
+    FEWVIEW_OT_copy_report,
+    FEWVIEW_OT_dismiss,
+)

@@ -6,6 +6,7 @@ import platform
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -18,6 +19,7 @@ from .cancelling import EXIT_CANCELLED, CancelRequest, catch_signals, watch_sign
 
 if TYPE_CHECKING:
     from ..pipeline import Job, Listener, Outcome
+    from ..presets import Settings
 
 EXIT_FINE, EXIT_INTERNAL, EXIT_USER_ERROR = 0, 1, 2
 
@@ -36,7 +38,7 @@ def on_terminal(job: protocol.Job) -> int:
     with terminal_listener(request) as listener:
         watch_signals(request, listener.stopping)
         return settle(
-            lambda: listener.finished(Path(job.output), run_job(job, Path(), listener)),
+            lambda: listener.finished(Path(job.output), run_job(_checked(job), Path(), listener)),
             failed=listener.failed,
             cancelled=listener.cancelled,
         )
@@ -80,7 +82,6 @@ def settle(
 def run_job(job: protocol.Job, base: Path, listener: "Listener") -> "Outcome":
     """Reconstruct into the job's output folder."""
     from .. import pipeline  # torch may be missing, and doctor must still start
-    from ..presets import PRESETS
     from ..workspace import open_workspace
 
     catch_signals()
@@ -88,9 +89,12 @@ def run_job(job: protocol.Job, base: Path, listener: "Listener") -> "Outcome":
     with open_workspace(resolved.output) as workspace:
         try:
             with _logging_to(workspace.log_path):
-                settings = PRESETS[job.preset]
                 return pipeline.run(
-                    resolved, workspace, settings=settings, stages=pipeline.STAGES, listener=listener
+                    resolved,
+                    workspace,
+                    settings=settings_of(job),
+                    stages=pipeline.STAGES,
+                    listener=listener,
                 )
         except (ReconstructionError, Cancelled):
             workspace.discard_if_nothing_done()
@@ -113,7 +117,20 @@ def resolve(job: protocol.Job, base: Path) -> "Job":
         device=job.device,
         seed=job.seed,
         truth=path_or_none(job.truth),
+        until=job.until,
     )
+
+
+def settings_of(job: protocol.Job) -> "Settings":
+    """The preset's settings, with the job's region where it names one."""
+    from ..presets import PRESETS
+
+    settings = PRESETS[job.preset]
+    if job.region_centre is None or job.region_radius is None:
+        return settings
+    x, y, z = job.region_centre
+    region = replace(settings.region, centre_world=(x, y, z), radius_world=job.region_radius)
+    return replace(settings, region=region)
 
 
 def hello() -> protocol.Hello:
@@ -153,6 +170,15 @@ def _run_job_file(job_path: Path, request: CancelRequest, speaking: Speaker) -> 
     outcome = run_job(job, job_path.absolute().parent, WireListener(request, speaking))
     output = job_path.absolute().parent / job.output
     say_last(speaking, protocol.Finished(output=str(output), files=outcome.files))
+
+
+def _checked(job: protocol.Job) -> protocol.Job:
+    """The job, if it could have come over the wire; ReconstructionError(SETTINGS_INVALID) otherwise."""
+    try:
+        return protocol.decode_job(protocol.encode_job(job))
+    except ValueError as error:  # ProtocolError, or a number that is not finite
+        text = f"The job cannot be used: {error}."
+        raise ReconstructionError(ErrorCode.SETTINGS_INVALID, text, "Check the options.") from error
 
 
 def _read_job(path: Path) -> protocol.Job:

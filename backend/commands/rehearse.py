@@ -1,78 +1,103 @@
-"""A rehearsal: the whole conversation of a run in about a second, without doing or needing anything.
+"""A rehearsal: the whole conversation of a run and files like its results, without doing or needing anything.
 
-It lets the add-on, and its tests, go through start, progress, preview, warning, cancel and result where
-neither torch nor photographs are. Standard library only.
+It lets the add-on, and its tests, go through start, progress, previews, a warning, cancel, failure, crash and
+result where neither torch nor photographs are. Standard library only.
 """
 
+import os
 import time
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
+from ..errors import ErrorCode, ReconstructionError
 from ..wire import protocol
 from ..wire.speaker import Speaker, speaker
+from . import rehearsed_files as files
 from .cancelling import CancelRequest, watch_signals, watch_stdin
 from .reconstruct import cancelled_message, failed_message, hello, say_last, settle
 
+ENDS = ("finished", "failed", "crashed")
+"""How a rehearsal can end."""
+
 _STAGES = ("photos", "cameras", "region", "stereo", "train", "mesh", "report")
-_STEPS = 10
-_STEP_S = 0.012
-
-_TETRAHEDRON = """ply
-format ascii 1.0
-element vertex 4
-property float x
-property float y
-property float z
-element face 4
-property list uchar int vertex_indices
-end_header
-1 1 1
-1 -1 -1
--1 1 -1
--1 -1 1
-3 0 1 2
-3 0 3 1
-3 0 2 3
-3 1 3 2
-"""
+_FEWEST_STEPS = 10
+"""Of a stage."""
+_LONGEST_STEP_S = 0.1
+"""The time in which a request to stop is heard."""
+_PREVIEW = "preview.ply"
 
 
-def rehearse(output: Path | None) -> int:
-    """Play a run on the wire; with an output folder, which must be new, it gets a preview and a mesh."""
+def rehearse(output: Path | None, seconds: float = 1.0, *, end: str = "finished") -> int:
+    """Play a run on the wire for about so long; the exit code, where it does not crash.
+
+    With an output folder, which must be new, it gets previews and results. `end` is one of ENDS: "failed"
+    runs out of memory, "crashed" aborts without a last word, both amid the stage that fits the surface.
+    """
     request = CancelRequest()
     with speaker() as speaking:
         speaking.say(hello())
         watch_signals(request, lambda: None)
         watch_stdin(request)
         return settle(
-            lambda: _play(output, request, speaking),
+            lambda: _play(output, seconds, end, request, speaking),
             failed=lambda error: say_last(speaking, failed_message(error)),
             cancelled=lambda: say_last(speaking, cancelled_message()),
         )
 
 
-def _play(output: Path | None, request: CancelRequest, speaking: Speaker) -> None:
+def _play(output: Path | None, seconds: float, end: str, request: CancelRequest, speaking: Speaker) -> None:
     if output is not None:
         output.mkdir(parents=True)
+    stage_s = max(0.0, seconds) / len(_STAGES)
     for index, name in enumerate(_STAGES):
         speaking.say(protocol.Stage(name=name, index=index + 1, count=len(_STAGES)))
-        for step in range(_STEPS + 1):
-            request.check()
-            time.sleep(_STEP_S)
-            remaining_s = (_STEPS - step) * _STEP_S
-            fraction = step / _STEPS
-            text = f"rehearsing, step {step}"
-            speaking.say(protocol.Progress(stage=name, fraction=fraction, text=text, remaining_s=remaining_s))
+        _play_stage(name, stage_s, request, speaking)
         if name == "cameras":
             speaking.say(protocol.Warned(text="This is a rehearsal: no photograph is read."))
-        if name == "stereo" and output is not None:
-            speaking.say(protocol.Preview(path=str(_write_tetrahedron(output / "preview.ply"))))
-    files: tuple[str, ...] = ()
-    if output is not None:
-        files = (_write_tetrahedron(output / "mesh.ply").name,)
-    speaking.say(protocol.Heartbeat(elapsed_s=_STEP_S * _STEPS * len(_STAGES)))
-    say_last(speaking, protocol.Finished(output=str(output or ""), files=files))
+        if name == "train":
+            _make_trouble(end)
+        if name in ("stereo", "train") and output is not None:
+            size = 0.5 if name == "stereo" else 0.75
+            path = _put(output / _PREVIEW, partial(files.write_mesh, size=size))
+            speaking.say(protocol.Preview(path=str(path)))
+    names = () if output is None else _write_results(output)
+    speaking.say(protocol.Heartbeat(elapsed_s=seconds))
+    say_last(speaking, protocol.Finished(output=str(output or ""), files=names))
 
 
-def _write_tetrahedron(path: Path) -> Path:
-    path.write_text(_TETRAHEDRON, encoding="ascii")
-    return path
+def _play_stage(name: str, stage_s: float, request: CancelRequest, speaking: Speaker) -> None:
+    steps = max(_FEWEST_STEPS, round(stage_s / _LONGEST_STEP_S))
+    for step in range(steps + 1):
+        request.check()
+        time.sleep(stage_s / (steps + 1))
+        fraction = step / steps
+        text = f"rehearsing, step {step}"
+        remaining_s = (1 - fraction) * stage_s
+        speaking.say(protocol.Progress(stage=name, fraction=fraction, text=text, remaining_s=remaining_s))
+
+
+def _make_trouble(end: str) -> None:
+    """End the rehearsal as a run may end that nobody wished for."""
+    if end == "failed":
+        raise ReconstructionError(
+            ErrorCode.OUT_OF_MEMORY,
+            "This is a rehearsal of a computer that ran out of memory.",
+            "Use a faster preset or fewer photographs, or close other programs.",
+        )
+    if end == "crashed":
+        os.abort()
+
+
+def _write_results(output: Path) -> tuple[str, ...]:
+    """Write what a run of the add-on leaves; the names."""
+    for name, write in files.RESULTS.items():
+        _put(output / name, write)
+    return tuple(files.RESULTS)
+
+
+def _put(path: Path, write: Callable[[Path], object]) -> Path:
+    """Write under another name first, so that nobody reads half a file; the path."""
+    part = path.with_name(path.name + ".part")
+    write(part)
+    return part.replace(path)

@@ -7,7 +7,7 @@ from pathlib import Path
 from ..errors import ErrorCode, ReconstructionError
 from ..scene import Photo, Progress, SolvedCameras
 from .known_cameras import read_placement
-from .lenses import undistorted_view
+from .lenses import photo_lens, undistorted_view
 from .structure_from_motion import estimate_placement
 from .triangulation import triangulate
 
@@ -59,10 +59,10 @@ def solve_cameras(
     positions, visibility = placement.sparse_positions, placement.sparse_visibility
     if not len(positions) and all(view.mask is None for view in views):
         positions, visibility = triangulate(tuple(views), workdir=workdir, seed=seed, progress=progress)
-    seen = {placed.index for placed in placement.placed}
     return SolvedCameras(
         views=tuple(views),
-        unplaced=tuple(photo.name for index, photo in enumerate(photos) if index not in seen),
+        lenses=tuple(photo_lens(photos[placed.index], placed) for placed in placement.placed),
+        unplaced=placement.unplaced,
         estimated=given is None,
         sparse_positions=positions,
         sparse_visibility=visibility,

@@ -1,6 +1,6 @@
 """Cameras that are given: nerfstudio's transforms.json, or a COLMAP model, matched to the photographs."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path, PurePosixPath
 
 import numpy as np
@@ -10,7 +10,7 @@ from jaxtyping import Float64
 
 from ..errors import ErrorCode, ReconstructionError
 from ..images import same_shape
-from ..scene import Photo
+from ..scene import Photo, Unplaced
 from .lenses import PlacedPhoto, Placement, rigid_matrix, sparse_points
 from .nerfstudio import camera_from_world, frame_lens, read_frames
 
@@ -98,6 +98,7 @@ def _from_transforms(photos: Sequence[Photo], path: Path) -> Placement:
         placed.append(_placed(index, photo, lens, camera_from_world(frame, photo.name)))
     return Placement(
         placed=tuple(placed),
+        unplaced=_unplaced(photos, matched, path),
         sparse_positions=np.zeros((0, 3)),
         sparse_visibility=np.zeros((0, len(placed)), bool),
         reprojection_error_px=None,
@@ -122,6 +123,7 @@ def _from_model(photos: Sequence[Photo], folder: Path) -> Placement:
     positions, visibility = sparse_points(model, ids)
     return Placement(
         placed=tuple(placed),
+        unplaced=_unplaced(photos, matched, folder),
         sparse_positions=positions,
         sparse_visibility=visibility,
         reprojection_error_px=None,
@@ -138,6 +140,14 @@ def _matched(photos: Sequence[Photo], camera_paths: Sequence[str], source: Path)
         )
         raise _unusable(text)
     return matched
+
+
+def _unplaced(photos: Sequence[Photo], matched: Mapping[int, int], source: Path) -> tuple[Unplaced, ...]:
+    """The photographs that no camera is named like."""
+    why = f"no camera in {source.name} has its name"
+    return tuple(
+        Unplaced(name=photo.name, why=why) for index, photo in enumerate(photos) if index not in matched
+    )
 
 
 def _likeness(photo_path: str, camera_path: str) -> int:
@@ -162,6 +172,9 @@ def _placed(index: int, photo: Photo, lens: pycolmap.Camera, pose: Float64[np.nd
             f"The camera of {photo.name} is for {lens.width}x{lens.height} pixels, the photograph has {ours}."
         )
         raise _unusable(text)
+    if not lens.is_perspective():  # asked for its focal length, pycolmap would crash
+        text = f"The camera of {photo.name} is a panorama ({lens.model.name}), which cannot be used."
+        raise _unusable(text, "Give photographs and cameras of one direction each.")
     if not np.isfinite(lens.params).all() or min(lens.focal_length_x, lens.focal_length_y) <= 0:
         raise _unusable(f"The focal length or distortion of {photo.name} is no usable number.")
     return PlacedPhoto(index=index, lens=lens, camera_from_world=checked_pose(pose, photo.name))

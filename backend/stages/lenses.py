@@ -4,9 +4,10 @@ A lens is a `pycolmap.Camera`: a projection model with its parameters over an im
 are in pixels, the centre of the top left one at (0.5, 0.5); rays are points with z = 1 in camera axes.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass
+from types import MappingProxyType
 
 import numpy as np
 import PIL.Image  # noqa: F401 - pycolmap loaded before Pillow corrupts memory when Pillow next saves
@@ -15,7 +16,7 @@ from jaxtyping import Bool, Float, Float32, Float64
 from scipy.ndimage import map_coordinates
 
 from ..errors import ErrorCode, ReconstructionError
-from ..scene import Camera, Decision, Photo, View
+from ..scene import Camera, Decision, Lens, Photo, Unplaced, View
 
 SMALLEST_ZOOM, LARGEST_ZOOM = 0.5, 4.0
 """Of the pinhole's focal length against the lens's. Below the first, a wide lens would lose half its
@@ -28,6 +29,28 @@ _ROUND_TRIP_PX = 0.01
 """Where a distortion folds back on itself, going there and back ends elsewhere."""
 _OUTSIDE_PX = 0.01
 """Of rounding; beyond it the border would repeat its last pixels."""
+
+PERSPECTIVE_TERMS = MappingProxyType(
+    {
+        "SIMPLE_PINHOLE": (),
+        "PINHOLE": (),
+        "SIMPLE_RADIAL": ("k1",),
+        "RADIAL": ("k1", "k2"),
+        "OPENCV": ("k1", "k2", "p1", "p2"),
+        "FULL_OPENCV": ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
+    }
+)
+FISHEYE_TERMS = MappingProxyType(
+    {
+        "SIMPLE_FISHEYE": (),
+        "FISHEYE": (),
+        "SIMPLE_RADIAL_FISHEYE": ("k1",),
+        "RADIAL_FISHEYE": ("k1", "k2"),
+        "OPENCV_FISHEYE": ("k1", "k2", "k3", "k4"),
+    }
+)
+"""Distortion coefficients of COLMAP's models, in its order. Each model holds those before it in its table, so
+that a lens can be said in the last one, or in the first of the common ones that has all it needs."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,6 +72,8 @@ class Placement:
     """In the order of the photographs."""
     sparse_positions: Float64[np.ndarray, "points 3"]
     sparse_visibility: Bool[np.ndarray, "points placed"]
+    unplaced: tuple[Unplaced, ...]
+    """The other photographs, in their order."""
     reprojection_error_px: float | None
     """In pixels of the photographs; None where the cameras were given."""
     decisions: tuple[Decision, ...] = ()
@@ -61,7 +86,7 @@ def undistorted_view(photo: Photo, placed: PlacedPhoto) -> View:
     Raises ReconstructionError(CAMERAS_UNUSABLE) where the lens does not bend light in a sensible way.
     """
     height, width = photo.image_srgb.shape[:2]
-    lens = rescaled_lens(placed.lens, width, height)
+    lens = rescaled_lens(colmap_lens(photo_lens(photo, placed)), width, height)
     zoom = smallest_filled_zoom_or_none(lens)
     if zoom is None:
         text = f"The lens distortion given for {photo.name} folds the picture or shows nothing of it."
@@ -80,6 +105,52 @@ def undistorted_view(photo: Photo, placed: PlacedPhoto) -> View:
     sources = source_pixels(lens, camera)
     mask = None if photo.mask is None else sampled(photo.mask, sources)
     return View(name=photo.name, camera=camera, image_srgb=sampled(photo.image_srgb, sources), mask=mask)
+
+
+def photo_lens(photo: Photo, placed: PlacedPhoto) -> Lens:
+    """The lens over the photograph's original size, in the plainest common model that says the same.
+
+    Views are made from this record alone, so that what is written of it gives the same views again.
+    """
+    lens = rescaled_lens(_plainest_lens(placed.lens), photo.original_width, photo.original_height)
+    params = tuple(float(value) for value in lens.params)
+    return Lens(model=lens.model.name, width=lens.width, height=lens.height, params=params)
+
+
+def colmap_lens(lens: Lens) -> pycolmap.Camera:
+    """The record as COLMAP's camera."""
+    return pycolmap.Camera(model=lens.model, width=lens.width, height=lens.height, params=list(lens.params))
+
+
+def _plainest_lens(lens: pycolmap.Camera) -> pycolmap.Camera:
+    """The same lens, in the plainest of the common models with two focal lengths where one says the same.
+
+    With two, each scales with its own side when a picture's sides are rounded to whole pixels.
+    """
+    name = lens.model.name
+    if name not in PERSPECTIVE_TERMS and name not in FISHEYE_TERMS:
+        return lens
+    terms = {**PERSPECTIVE_TERMS, **FISHEYE_TERMS}
+    values = lens.params[len(lens.params) - len(terms[name]) :]
+    coefficients = dict(zip(terms[name], values, strict=True))
+    model = _plainest_model(coefficients, fisheye=name in FISHEYE_TERMS)
+    focal_and_centre = (
+        lens.focal_length_x,
+        lens.focal_length_y,
+        lens.principal_point_x,
+        lens.principal_point_y,
+    )
+    params = [*focal_and_centre, *(coefficients.get(term, 0.0) for term in terms[model])]
+    return pycolmap.Camera(model=model, width=lens.width, height=lens.height, params=params)
+
+
+def _plainest_model(coefficients: Mapping[str, float], *, fisheye: bool) -> str:
+    """Of the models with two focal lengths, the smallest that has all coefficients that are not 0."""
+    if fisheye:
+        return "OPENCV_FISHEYE"
+    needed = {term for term, value in coefficients.items() if value != 0}
+    common = ("PINHOLE", "OPENCV", "FULL_OPENCV")
+    return next(name for name in common if needed <= set(PERSPECTIVE_TERMS[name]))
 
 
 def rescaled_lens(lens: pycolmap.Camera, width: int, height: int) -> pycolmap.Camera:

@@ -4,7 +4,7 @@
 being seen, both growing with how much evidence there is and saturating.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import fast_simplification
 import numpy as np
@@ -17,8 +17,9 @@ from scipy.spatial import cKDTree
 from skimage.measure import marching_cubes
 
 from ..errors import ErrorCode, ReconstructionError
-from ..maths.grid import near_surface, spacing
+from ..maths.grid import near_surface, refined, spacing
 from ..maths.raycast import RayCaster, visible_from
+from ..maths.sampling import colours_at
 from ..scene import Decision, Progress, Region, SurfaceMesh, View, transform_points
 from .stereo import DepthMap, StereoResult
 from .train import Surface
@@ -31,6 +32,9 @@ KeptFaces = Int64[np.ndarray, "kept_faces 3"]
 
 MEASURED_EDGES = 0.03
 """Share of the pictures' edges. Measured: 0 to 0.001 for objects, 0.06 to 0.5 for facades and floors."""
+
+PREVIEW_NODES, PREVIEW_FACES = 64, 20_000
+"""Of a mesh that is only looked at: at most so many nodes along each axis, and faces."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -88,6 +92,36 @@ def extract_mesh(
         colours_srgb=colours,
         support=support,
         decisions=decisions,
+    )
+
+
+def preview_mesh(
+    surface: Surface, points: Float64[np.ndarray, "points 3"], colours_srgb: Float32[np.ndarray, "points 3"]
+) -> SurfaceMesh | None:
+    """The zero level of an unfinished field at modest resolution, world frame; None where it has none.
+
+    A vertex has the colour of the nearest of the points (world frame), and no support: none is known yet.
+    """
+    nodes = min(len(surface.distance), PREVIEW_NODES)
+    while True:
+        coarse = refined(torch.from_numpy(surface.distance), nodes).numpy()
+        if not coarse.min() < 0 < coarse.max():
+            return None
+        vertices, faces = level_set(replace(surface, distance=coarse))
+        if len(faces) <= PREVIEW_FACES:
+            break
+        # The number of faces grows with the square of the nodes.
+        nodes = min(nodes - 1, int(nodes * (PREVIEW_FACES / len(faces)) ** 0.5))
+    colours = np.full((len(vertices), 3), 128, np.uint8)
+    if len(points):
+        _, nearest = cKDTree(points).query(vertices)
+        colours = np.clip(colours_srgb[nearest] * 255 + 0.5, 0, 255).astype(np.uint8)
+    return SurfaceMesh(
+        vertices=vertices,
+        faces=faces,
+        normals=vertex_normals(vertices, faces).astype(np.float32),
+        colours_srgb=colours,
+        support=np.zeros(len(vertices), np.float32),
     )
 
 
@@ -246,7 +280,7 @@ def vertex_colours(
         mine = np.flatnonzero(seen[:, column])
         towards = view.camera.position - vertices[mine]
         facing = (towards * normals[mine]).sum(axis=1) / np.linalg.norm(towards, axis=1)
-        sampled = _colours_at(view, vertices[mine])
+        sampled = colours_at(view, vertices[mine])
         # a pixel half off the subject has half the backdrop's colour: the fourth power leaves it out
         share = (np.clip(facing, 1e-3, 1) * sampled[:, 3]) ** 4
         total[mine] += share[:, None] * sampled[:, :3]
@@ -259,22 +293,3 @@ def vertex_colours(
         mixed = (near[..., None] * colours[known][np.atleast_2d(nearest.T).T]).sum(axis=1)
         colours[~known] = mixed / near.sum(axis=1, keepdims=True)
     return np.clip(colours * 255 + 0.5, 0, 255).astype(np.uint8)
-
-
-def _colours_at(view: View, points: Vertices) -> Float64[np.ndarray, "points 4"]:
-    """Bilinear colours and mask of the photograph where it shows the points, which lie in front of it."""
-    homogeneous = transform_points(view.camera.camera_from_world, points) @ view.camera.intrinsics.T
-    pixel = homogeneous[:, :2] / homogeneous[:, 2:] - 0.5
-    limit = np.array([view.camera.width - 1, view.camera.height - 1])
-    low = np.clip(np.floor(pixel), 0, np.maximum(limit - 1, 0)).astype(int)
-    t = np.clip(pixel - low, 0, 1)
-    (x, y), (s, u) = low.T, t.T[..., None]
-    mask = np.ones(view.image_srgb.shape[:2], np.float32) if view.mask is None else view.mask
-    image, right, down = (
-        np.dstack([view.image_srgb, mask]),
-        np.minimum(x + 1, limit[0]),
-        np.minimum(y + 1, limit[1]),
-    )
-    upper = image[y, x] * (1 - s) + image[y, right] * s
-    lower = image[down, x] * (1 - s) + image[down, right] * s
-    return np.asarray(upper * (1 - u) + lower * u, np.float64)

@@ -1,13 +1,16 @@
-"""nerfstudio's transforms.json, read and written.
+"""nerfstudio's transforms.json, read and written; each is the other's inverse.
 
 Poses are camera-to-world with OpenGL's camera axes. The frame they stand in is the world: `applied_transform`
 and `applied_scale` tell how they came from others and are no part of them. Intrinsics may stand at the top,
-for all frames, or in a frame.
+for all frames, or in a frame. Distortion is told by k1, k2, p1 ... and camera_model. Lenses that nerfstudio
+has no words for are written with COLMAP's, as `colmap_params`: other programs then refuse them rather than
+take them for something else.
 """
 
 import json
 import math
 from collections.abc import Mapping
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -17,13 +20,14 @@ import pycolmap
 from jaxtyping import Float64
 
 from ..errors import ErrorCode, ReconstructionError
-from ..scene import Photo, SolvedCameras
+from ..scene import Lens, Photo, Region, SolvedCameras, View
+from .lenses import FISHEYE_TERMS, PERSPECTIVE_TERMS, colmap_lens
 
 OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 """Camera axes: OpenGL has y up and looks along -z. Its own inverse."""
 
-_FISHEYE_MODELS = frozenset({"OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE"})
-_PERSPECTIVE_MODELS = frozenset({"PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV"})
+_PINHOLE_PARAMS = ("fl_x", "fl_y", "cx", "cy")
+_COLMAP_PARAMS = "colmap_params"
 
 Frame = Mapping[str, Any]
 """One frame's entries over those at the top of the file."""
@@ -68,46 +72,86 @@ def frame_lens(frame: Frame, photo: Photo) -> pycolmap.Camera:
     """
     width = _number(frame, "w", photo, float(photo.original_width))
     height = _number(frame, "h", photo, float(photo.original_height))
+    model = str(frame.get("camera_model", "OPENCV")).upper()
+    size = {"width": round(width), "height": round(height)}
+    if _COLMAP_PARAMS in frame:
+        return _colmap_lens(frame, model, photo, size)
     fx, fy = _focal_lengths(frame, photo, width, height)
     cx, cy = _number(frame, "cx", photo, width / 2), _number(frame, "cy", photo, height / 2)
-    k1, k2, k3, k4, p1, p2 = (_number(frame, key, photo, 0.0) for key in ("k1", "k2", "k3", "k4", "p1", "p2"))
-    model = str(frame.get("camera_model", "OPENCV")).upper()
-    if model in _FISHEYE_MODELS or frame.get("is_fisheye") is True:
-        name, params = "OPENCV_FISHEYE", [fx, fy, cx, cy, k1, k2, k3, k4]
-    elif model not in _PERSPECTIVE_MODELS:
-        known = ", ".join(sorted(_PERSPECTIVE_MODELS | _FISHEYE_MODELS))
+    if frame.get("is_fisheye") is True or model in FISHEYE_TERMS:
+        name, terms = "OPENCV_FISHEYE", FISHEYE_TERMS["OPENCV_FISHEYE"]
+    elif model in PERSPECTIVE_TERMS:
+        name, terms = "FULL_OPENCV", PERSPECTIVE_TERMS["FULL_OPENCV"]
+    else:
+        known = ", ".join(sorted(PERSPECTIVE_TERMS | FISHEYE_TERMS))
         raise _unusable(f"The camera model {model} of {photo.name} is not supported.", f"Known are {known}.")
-    elif k4 != 0:
+    coefficients = {term: _number(frame, term, photo, 0.0) for term in terms}
+    if name == "FULL_OPENCV" != model and coefficients["k4"] != 0:
         text = f"{photo.name} has a fourth distortion coefficient k4, which only fisheye lenses may have."
         raise _unusable(text, "Calibrate with k1, k2, k3, p1 and p2, or name the camera_model.")
-    elif k3 != 0:
-        name, params = "FULL_OPENCV", [fx, fy, cx, cy, k1, k2, p1, p2, k3, 0.0, 0.0, 0.0]
-    elif any((k1, k2, p1, p2)):
-        name, params = "OPENCV", [fx, fy, cx, cy, k1, k2, p1, p2]
+    return pycolmap.Camera(model=name, params=[fx, fy, cx, cy, *coefficients.values()], **size)
+
+
+def transforms_json(solved: SolvedCameras, region: Region) -> dict[str, Any]:
+    """The cameras of the photographs as they are, with their lenses, as the content of a transforms.json.
+
+    Given back with the same photographs it gives the same views. What other readers pass over stands under
+    `fewview`: how good the cameras are, what was to be reconstructed, and who could not be placed.
+    """
+    frames = [_frame(view, lens) for view, lens in zip(solved.views, solved.lenses, strict=True)]
+    models = {frame["camera_model"] for frame in frames}
+    return {
+        # nerfstudio itself looks for the model only here.
+        "camera_model": models.pop() if len(models) == 1 else "PINHOLE",
+        "fewview": {
+            "estimated": solved.estimated,
+            "reprojection_error_px": solved.reprojection_error_px,
+            "region": {
+                "centre_world": region.centre_world.tolist(),
+                "radius_world": region.radius_world,
+            },
+            "unplaced": [asdict(photo) for photo in solved.unplaced],
+        },
+        "frames": frames,
+    }
+
+
+def _frame(view: View, lens: Lens) -> dict[str, Any]:
+    """Inverse of frame_lens and camera_from_world."""
+    colmap = colmap_lens(lens)
+    focal_and_centre = (
+        colmap.focal_length_x,
+        colmap.focal_length_y,
+        colmap.principal_point_x,
+        colmap.principal_point_y,
+    )
+    terms = {**PERSPECTIVE_TERMS, **FISHEYE_TERMS}.get(lens.model)
+    if terms is None:
+        distortion: dict[str, Any] = {_COLMAP_PARAMS: list(lens.params)}
     else:
-        name, params = "PINHOLE", [fx, fy, cx, cy]
-    return pycolmap.Camera(model=name, width=round(width), height=round(height), params=params)
+        distortion = dict(zip(terms, lens.params[len(lens.params) - len(terms) :], strict=True))
+    world_from_camera = np.linalg.inv(view.camera.camera_from_world)
+    return {
+        "file_path": view.name,
+        "camera_model": lens.model,
+        "w": lens.width,
+        "h": lens.height,
+        **dict(zip(_PINHOLE_PARAMS, focal_and_centre, strict=True)),
+        **distortion,
+        "transform_matrix": (world_from_camera @ OPENCV_FROM_OPENGL).tolist(),
+    }
 
 
-def transforms_json(solved: SolvedCameras) -> dict[str, Any]:
-    """The views' cameras as the content of a transforms.json, for the undistorted photographs."""
-    frames = []
-    for view in solved.views:
-        camera = view.camera
-        world_from_camera = np.linalg.inv(camera.camera_from_world)
-        frames.append(
-            {
-                "file_path": view.name,
-                "w": camera.width,
-                "h": camera.height,
-                "fl_x": camera.fx_px,
-                "fl_y": camera.fy_px,
-                "cx": camera.cx_px,
-                "cy": camera.cy_px,
-                "transform_matrix": (world_from_camera @ OPENCV_FROM_OPENGL).tolist(),
-            }
-        )
-    return {"camera_model": "PINHOLE", "frames": frames}
+def _colmap_lens(frame: Frame, model: str, photo: Photo, size: dict[str, int]) -> pycolmap.Camera:
+    """The lens in COLMAP's own words."""
+    values = frame[_COLMAP_PARAMS]
+    plain = isinstance(values, list) and all(type(value) in (int, float) for value in values)
+    if not plain or model not in set(pycolmap.CameraModelId.__members__) - {"INVALID"}:
+        raise _unusable(f"The lens of {photo.name} is none of COLMAP's models with its parameters.")
+    lens = pycolmap.Camera(model=model, params=values, **size)
+    if not lens.verify_params() or not lens.is_perspective():
+        raise _unusable(f"The lens of {photo.name} has too few or too many parameters for a {model} lens.")
+    return lens
 
 
 def _focal_lengths(frame: Frame, photo: Photo, width: float, height: float) -> tuple[float, float]:

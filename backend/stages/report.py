@@ -253,7 +253,8 @@ def report_numbers(report: Report) -> dict[str, object]:
         "cameras": {
             "estimated": solved.estimated,
             "num_placed": len(solved.views),
-            "unplaced": list(solved.unplaced),
+            "unplaced": [photo.name for photo in solved.unplaced],
+            "unplaced_because": [photo.why for photo in solved.unplaced],
             "reprojection_error_px": solved.reprojection_error_px,
         },
         "num_stereo_points": len(inputs.points.positions),

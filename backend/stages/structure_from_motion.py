@@ -15,10 +15,10 @@ import pycolmap
 from jaxtyping import Float32, UInt8
 
 from ..images import fitted_size, read_image, resized
-from ..scene import Decision, Photo, Progress
+from ..scene import Decision, Photo, Progress, Unplaced
 from .lens_refinement import refine_lenses
 from .lenses import PlacedPhoto, Placement, rigid_matrix, sparse_points
-from .parallax import require_parallax, why_none_placed
+from .parallax import require_parallax, why_none_placed, why_unplaced
 
 LENS_MODEL = "SIMPLE_RADIAL"
 """One focal length, the principal point and one distortion coefficient. With separate focal lengths and four
@@ -102,7 +102,7 @@ def estimate_placement(
     decisions = refine_lenses(model)
     _drop_bad_points(model)
     require_parallax(model, database)
-    return _placement(model, photos, decisions)
+    return _placement(model, photos, decisions, database)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -285,7 +285,10 @@ def _drop_bad_points(model: pycolmap.Reconstruction) -> None:
 
 
 def _placement(
-    model: pycolmap.Reconstruction, photos: Sequence[Photo], decisions: tuple[Decision, ...]
+    model: pycolmap.Reconstruction,
+    photos: Sequence[Photo],
+    decisions: tuple[Decision, ...],
+    database: Path,
 ) -> Placement:
     images = sorted((_picture_index(model.images[i].name), i) for i in model.reg_image_ids())
     placed = tuple(
@@ -297,10 +300,16 @@ def _placement(
         for index, image_id in images
     )
     positions, visibility = sparse_points(model, [image_id for _, image_id in images])
+    seen = {index for index, _ in images}
+    missing = [index for index in range(len(photos)) if index not in seen]
+    why = why_unplaced(database, [picture_name(index) for index in missing])
     first = placed[0]
     photo_px_per_picture_px = photos[first.index].image_srgb.shape[1] / first.lens.width
     return Placement(
         placed=placed,
+        unplaced=tuple(
+            Unplaced(name=photos[index].name, why=text) for index, text in zip(missing, why, strict=True)
+        ),
         sparse_positions=positions,
         sparse_visibility=visibility,
         reprojection_error_px=model.compute_mean_reprojection_error() * photo_px_per_picture_px,

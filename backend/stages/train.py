@@ -5,6 +5,7 @@ order), with free space and with the level before (linear_fit); then gradient st
 the photographs (render_fit).
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -48,6 +49,14 @@ class Surface:
     decisions: tuple[Decision, ...] = ()
 
 
+ShowSurface = Callable[[Surface], None]
+"""Called with the field as it is so far; must not change it."""
+
+
+def show_nothing(_surface: Surface) -> None:
+    """A callback for those who do not want to look at unfinished surfaces."""
+
+
 def fit_surface(
     views: tuple[View, ...],
     region: Region,
@@ -57,8 +66,12 @@ def fit_surface(
     device: torch.device,
     generator: torch.Generator,
     progress: Progress,
+    show: ShowSurface = show_nothing,
 ) -> Surface:
-    """The distance field that agrees with points, silhouettes and photographs."""
+    """The distance field that agrees with points, silhouettes and photographs.
+
+    `show` gets the field each time the points are fitted on a finer grid, before any steps of rendering.
+    """
     progress(0.0, "finding the extent of the surface")
     with torch.no_grad():
         scene = measurements(views, region, region, stereo, device)
@@ -73,6 +86,7 @@ def fit_surface(
         with torch.no_grad():
             distance = fit_level(scene, refined(distance, nodes), config.smoothness)
         done += 10
+        show(Surface(distance=distance.cpu().numpy(), grid_from_world=frame.object_from_world))
         if steps:
             tell = _within(progress, done / total, (done + steps) / total)
             distance = refine(scene, distance, steps, config.render, generator, tell)

@@ -14,9 +14,13 @@ import pytest
 ROOT = Path(__file__).resolve().parents[2]
 EXTENSION = "bl_ext.user_default.fewview"
 
-# Before bpy is imported: the tests must neither see nor change the settings of the person who runs them.
-_resources = tempfile.TemporaryDirectory(prefix="fewview-blender-")
-os.environ["BLENDER_USER_RESOURCES"] = _resources.name
+# The tests must neither see nor change the settings of the person who runs them. Blender reads this when it
+# starts: as a module that is later, as a program it has happened already.
+if "bpy" not in sys.modules:
+    _resources = tempfile.TemporaryDirectory(prefix="fewview-blender-")
+    os.environ["BLENDER_USER_RESOURCES"] = _resources.name
+elif "BLENDER_USER_RESOURCES" not in os.environ:
+    pytest.exit("set BLENDER_USER_RESOURCES to an empty folder, as `make test-blender` does", returncode=2)
 
 
 @pytest.fixture(scope="session")

@@ -19,7 +19,21 @@ import torch
 
 from backend.__main__ import main
 from backend.commands import reconstruct
-from backend.scene import Camera, Photo, Progress, Region, SolvedCameras, SurfaceMesh, SurfacePoints, View
+from backend.scene import (
+    Camera,
+    Lens,
+    Photo,
+    Progress,
+    Region,
+    SolvedCameras,
+    SurfaceMesh,
+    SurfacePoints,
+    Unplaced,
+    View,
+    to_unit_sphere,
+)
+from backend.stages.region import RegionConfig
+from backend.stages.train import ShowSurface, Surface
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -87,17 +101,20 @@ def solve_cameras(
     views = tuple(View(name=p.name, camera=camera, image_srgb=p.image_srgb, mask=None) for p in photos[1:])
     return SolvedCameras(
         views=views,
-        unplaced=(photos[0].name,),
+        lenses=(Lens(model="PINHOLE", width=6, height=4, params=(5.0, 5.0, 3.0, 2.0)),) * len(views),
+        unplaced=(Unplaced(name=photos[0].name, why="on purpose"),),
         estimated=True,
-        sparse_positions=np.zeros((0, 3)),
-        sparse_visibility=np.zeros((0, len(views)), bool),
+        sparse_positions=np.array([[0.0, 0.0, 2.0], [0.1, 0.0, 2.0]]),
+        sparse_visibility=np.ones((2, len(views)), bool),
         reprojection_error_px=None,
     )
 
 
-def find_region(_solved: SolvedCameras, _config: Any, *, progress: Progress) -> Region:
+def find_region(_solved: SolvedCameras, config: RegionConfig, *, progress: Progress) -> Region:
     work("region", progress)
-    return Region(object_from_world=np.eye(4))
+    if config.centre_world is None or config.radius_world is None:
+        return Region(object_from_world=np.eye(4))
+    return Region(object_from_world=to_unit_sphere(np.array(config.centre_world), config.radius_world))
 
 
 def match_views(
@@ -118,10 +135,18 @@ def match_views(
 
 
 def fit_surface(
-    *_earlier: Any, device: torch.device, generator: torch.Generator, progress: Progress
+    *_earlier: Any, device: torch.device, generator: torch.Generator, progress: Progress, show: ShowSurface
 ) -> FakeSurface:
     work("train", progress)
+    show(ball())
     return FakeSurface(values=torch.rand(3, generator=generator, device=device).numpy())
+
+
+def ball() -> Surface:
+    """A ball with half the radius of the grid."""
+    steps = np.linspace(-1, 1, 16, dtype=np.float32)
+    x, y, z = np.meshgrid(steps, steps, steps, indexing="ij")
+    return Surface(distance=np.sqrt(x**2 + y**2 + z**2) - np.float32(0.5), grid_from_world=np.eye(4))
 
 
 def extract_mesh(*earlier: Any, progress: Progress) -> SurfaceMesh:

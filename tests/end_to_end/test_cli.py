@@ -26,7 +26,8 @@ from backend.wire.protocol import Failed, Finished, Hello, Job, Message, decode
 ROOT = Path(__file__).resolve().parents[2]
 FAKE_STAGES = Path(__file__).with_name("fake_stages.py")
 STAGES = ["photos", "cameras", "region", "stereo", "train", "mesh"]
-RESULTS = {"mesh.ply", "mesh.glb", "points.ply", "cameras.json", "report.json", "report.html", "log.txt"}
+CAMERA_RESULTS = {"cameras.json", "sparse.ply", "log.txt"}
+RESULTS = CAMERA_RESULTS | {"mesh.ply", "mesh.glb", "points.ply", "report.json", "report.html"}
 posix_only = pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX")
 
 
@@ -162,10 +163,56 @@ def test_rehearse_plays_the_whole_conversation_without_any_package(case: Case) -
         assert process.stdout is not None
         heard = messages(process.stdout.read())
     assert {type(message) for message in heard} == {
-        kind for name, kind in protocol.MESSAGES.items() if name not in ("cancel", "failed")
+        kind for name, kind in protocol.MESSAGES.items() if name not in ("cancel", "failed", "checked")
     }
     assert isinstance(heard[-1], Finished)
+    assert set(heard[-1].files) >= {"mesh.ply", "cameras.json", "sparse.ply", "report.json", "report.html"}
     assert all((case.output / name).exists() for name in heard[-1].files)
+    assert not list(case.output.glob("*.part"))
+    previews = [message.path for message in heard if isinstance(message, protocol.Preview)]
+    assert previews
+    assert all(len(read_mesh(Path(path)).faces) == 4 for path in previews)
+
+
+def rehearsal(call: str) -> subprocess.Popen[str]:
+    """rehearse() with the arguments of the call, in a program of its own."""
+    script = f"import sys; from backend.commands.rehearse import rehearse; sys.exit(rehearse({call}))"
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+    return subprocess.Popen([sys.executable, "-S", "-c", script], cwd=ROOT, text=True, **pipes)
+
+
+def test_a_rehearsal_can_run_out_of_memory(case: Case) -> None:
+    with rehearsal(f"__import__('pathlib').Path({str(case.output)!r}), 0.2, end='failed'") as process:
+        assert process.stdout is not None
+        last = messages(process.stdout.read())[-1]
+    assert process.returncode == 2
+    assert isinstance(last, Failed)
+    assert last.code == "out_of_memory"
+    assert not (case.output / "mesh.ply").exists()
+
+
+@posix_only
+def test_a_rehearsal_can_crash() -> None:
+    with rehearsal("None, 0.2, end='crashed'") as process:
+        assert process.stdout is not None
+        heard = [decode(line) for line in process.stdout]
+    assert process.returncode == -signal.SIGABRT
+    assert not any(isinstance(message, Finished | Failed) for message in heard)
+
+
+def test_a_long_rehearsal_takes_its_time_and_hears_a_cancel_at_once() -> None:
+    with rehearsal("None, 300.0") as process:
+        assert process.stdin is not None
+        assert process.stdout is not None
+        process.stdout.readline()
+        time.sleep(1.0)
+        assert process.poll() is None
+        asked_s = time.monotonic()
+        process.stdin.write('{"type": "cancel"}\n')
+        process.stdin.flush()
+        process.stdout.read()
+    assert time.monotonic() - asked_s < 1.0
+    assert process.returncode == 130
 
 
 def test_the_client_and_a_rehearsal_understand_each_other(case: Case) -> None:
@@ -213,7 +260,7 @@ def test_a_run_leaves_its_results_and_the_next_one_resumes(case: Case) -> None:
         Path(line).name for line in first.stdout.splitlines() if line.startswith(str(case.output))
     } >= RESULTS
     assert "noise" not in first.stdout.splitlines()[-1]
-    assert "Warning: 1 of 3 photographs could not be placed: 0.png." in first.stderr
+    assert "Warning: 1 of 3 photographs could not be placed: 0.png (on purpose)." in first.stderr
     assert "[4/7] stereo done in" in first.stderr
     assert len(read_mesh(case.output / "mesh.ply").faces) == 1
     second = case.run()
@@ -369,8 +416,82 @@ def test_a_job_file_gives_a_conversation(case: Case) -> None:
     assert all(Path(path).is_file() for path in previews)
 
 
+def counted_stages(heard: list[Message]) -> list[tuple[str, int, int]]:
+    return [(m.name, m.index, m.count) for m in heard if isinstance(m, protocol.Stage)]
+
+
+def converse(case: Case, step_s: float = 0.0, **changes: object) -> list[Message]:
+    """A whole run on the wire."""
+    with case.start(step_s, str(case.write_job(**changes))) as process:
+        assert process.stdout is not None
+        return messages(process.stdout.read())
+
+
+def test_a_run_may_end_with_the_cameras_and_a_later_one_goes_on(case: Case) -> None:
+    heard = converse(case, until="cameras")
+    assert isinstance(heard[-1], Finished)
+    assert set(heard[-1].files) == CAMERA_RESULTS
+    assert counted_stages(heard) == [("photos", 1, 3), ("cameras", 2, 3), ("region", 3, 3)]
+    assert set(case.results()) == CAMERA_RESULTS
+    assert b"element vertex 2\n" in (case.output / "sparse.ply").read_bytes()
+    told = json.loads((case.output / "cameras.json").read_text())
+    assert [frame["file_path"] for frame in told["frames"]] == ["1.png", "2.png"]
+    assert told["fewview"]["unplaced"] == [{"name": "0.png", "why": "on purpose"}]
+    assert case.done() == STAGES[:3]
+    again = converse(case)
+    assert isinstance(again[-1], Finished)
+    assert counted_stages(again)[-1] == ("report", 7, 7)
+    assert case.done() == STAGES[3:]
+    assert converse(case, until="cameras")[-1] == heard[-1]
+    assert case.done() == []
+    assert set(case.results()) == RESULTS, "what the whole run left stays"
+
+
+def test_a_given_region_is_used_and_what_hangs_on_it_is_redone(case: Case) -> None:
+    converse(case)
+    case.done()
+    converse(case, region_centre=[1, -2.5, 3.0], region_radius=0.5)
+    assert case.done() == STAGES[2:]
+    region = json.loads((case.output / "cameras.json").read_text())["fewview"]["region"]
+    assert region["centre_world"] == pytest.approx([1, -2.5, 3])
+    assert region["radius_world"] == pytest.approx(0.5)
+    converse(case, region_centre=[1, -2.5, 3.0], region_radius=0.6)
+    assert case.done() == STAGES[2:]
+
+
+def test_a_region_on_the_command_line(case: Case) -> None:
+    result = case.run("none", "none", "--region", "0", "-1", "0", "1e12")
+    assert result.returncode == 2
+    assert "too large" in result.stderr
+    assert not case.output.exists()
+    assert case.run("none", "none", "--region", "0", "-1", "0", "2.5").returncode == 0
+    region = json.loads((case.output / "report.json").read_text())["region"]
+    assert region["centre_world"] == pytest.approx([0, -1, 0])
+    assert region["radius_world"] == pytest.approx(2.5)
+
+
+def test_previews_are_points_then_whole_meshes(case: Case) -> None:
+    """Long enough after each other: fitting takes 1.2 s."""
+    converse(case, until="cameras")
+    heard = converse(case, step_s=0.12)
+    names = [m.name if isinstance(m, protocol.Stage) else m for m in heard]
+    points, mesh = (m for m in heard if isinstance(m, protocol.Preview))
+    assert names.index("stereo") < names.index(points) < names.index("train") < names.index(mesh)
+    assert b"element face" not in Path(points.path).read_bytes()
+    assert len(read_mesh(Path(mesh.path)).faces) > 100
+
+
 @pytest.mark.parametrize(
-    "change", [{"protocol": 99}, {"preset": "best"}, {"surprise": 1}, {"images": "photos"}]
+    "change",
+    [
+        {"protocol": 99},
+        {"preset": "best"},
+        {"surprise": 1},
+        {"images": "photos"},
+        {"until": "mesh"},
+        {"region_centre": [0, 0, 0]},
+        {"region_centre": [0, 0, 0], "region_radius": -1.0},
+    ],
 )
 def test_a_wrong_job_is_refused(case: Case, change: dict[str, object]) -> None:
     result = case.finish([*case.command(), str(case.write_job(**change))], input="")

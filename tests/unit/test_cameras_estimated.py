@@ -105,7 +105,9 @@ def test_cameras_of_rendered_photographs(focal_px: float | None, corner: list[Ph
     unrelated = noise_photo("noise.png", 5)
     solved = solve([*photos, unrelated], tmp_path)
     assert [view.name for view in solved.views] == list(POSES)
-    assert solved.unplaced == ("noise.png",)
+    (left_out,) = solved.unplaced
+    assert left_out.name == "noise.png"
+    assert left_out.why == "it shares no features with the others that could be recognised"
     assert solved.estimated
     assert solved.reprojection_error_px is not None
     assert solved.reprojection_error_px < 0.5

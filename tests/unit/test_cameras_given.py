@@ -1,7 +1,9 @@
 """Cameras from files: round trips, name matching, refusals."""
 
 import json
+import re
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,10 +14,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from backend.errors import ErrorCode, ReconstructionError
-from backend.scene import Photo, SolvedCameras, no_progress
+from backend.scene import Photo, Region, SolvedCameras, Unplaced, no_progress, to_unit_sphere
 from backend.stages.cameras import CamerasConfig, solve_cameras
 from backend.stages.known_cameras import checked_pose, match_by_name
-from backend.stages.nerfstudio import OPENCV_FROM_OPENGL, transforms_json
+from backend.stages.nerfstudio import OPENCV_FROM_OPENGL, frame_lens, transforms_json
 
 WIDTH, HEIGHT = 64, 48
 
@@ -57,13 +59,14 @@ def solve_frames(photos: list[Photo], content: dict[str, Any], tmp_path: Path) -
     return solve(photos, path, tmp_path)
 
 
+REGION = Region(object_from_world=to_unit_sphere(np.array([1.0, -2.0, 3.0]), 4.0))
 PHOTOS = [make_photo("a.jpg"), make_photo("b.jpg"), make_photo("c.jpg")]
 FRAMES = [make_frame("a.jpg", 1), make_frame("b.jpg", 2), make_frame("c.jpg", 3)]
 
 
 def test_transforms_are_read_as_they_were_written(tmp_path: Path) -> None:
     first = solve_frames(PHOTOS, {"frames": FRAMES}, tmp_path)
-    again = solve_frames(PHOTOS, transforms_json(first), tmp_path)
+    again = solve_frames(PHOTOS, transforms_json(first, REGION), tmp_path)
     assert [view.name for view in first.views] == ["a.jpg", "b.jpg", "c.jpg"]
     assert not first.estimated
     assert first.unplaced == ()
@@ -73,6 +76,131 @@ def test_transforms_are_read_as_they_were_written(tmp_path: Path) -> None:
         np.testing.assert_allclose(view.camera.camera_from_world, other.camera.camera_from_world, atol=1e-12)
         np.testing.assert_allclose(view.camera.intrinsics, other.camera.intrinsics)
         np.testing.assert_array_equal(view.image_srgb, photo.image_srgb)
+
+
+LENSES = {
+    "SIMPLE_PINHOLE": [150.0, 83.0, 57.0],
+    "PINHOLE": [150.0, 153.0, 83.0, 57.0],
+    "SIMPLE_RADIAL": [150.0, 80.0, 60.0, -0.2],
+    "RADIAL": [150.0, 82.0, 57.0, 0.15, 0.02],
+    "OPENCV": [150.0, 153.0, 78.0, 61.0, -0.15, 0.03, 0.004, -0.003],
+    "FULL_OPENCV": [150.0, 151.0, 80.0, 60.0, -0.2, 0.05, 0.001, 0.002, 0.01, 0.02, 0.003, 0.001],
+    "SIMPLE_FISHEYE": [90.0, 80.0, 60.0],
+    "FISHEYE": [90.0, 92.0, 80.0, 60.0],
+    "SIMPLE_RADIAL_FISHEYE": [90.0, 80.0, 60.0, 0.02],
+    "RADIAL_FISHEYE": [90.0, 80.0, 60.0, 0.02, -0.01],
+    "OPENCV_FISHEYE": [90.0, 91.0, 80.0, 60.0, 0.02, -0.01, 0.003, -0.001],
+    "FOV": [100.0, 101.0, 80.0, 60.0, 0.8],
+    "THIN_PRISM_FISHEYE": [90.0, 91.0, 80.0, 60.0, 0.01, 0.002, 0.001, 0.002, 0.003, 0.001, 0.001, 0.002],
+    "RAD_TAN_THIN_PRISM_FISHEYE": [90.0, 91.0, 80.0, 60.0, 0.01, *[0.001] * 11],
+    "SIMPLE_DIVISION": [150.0, 80.0, 60.0, -0.1],
+    "DIVISION": [150.0, 151.0, 80.0, 60.0, -0.1],
+    "EUCM": [100.0, 101.0, 80.0, 60.0, 0.5, 1.1],
+}
+"""Parameters of every perspective model of COLMAP over 160x120 pixels."""
+WITHOUT_WORDS = [name for name in LENSES if re.search("FOV|PRISM|DIVISION|EUCM", name)]
+"""Models that nerfstudio's files cannot say."""
+
+
+def test_no_lens_model_is_forgotten() -> None:
+    known = set(pycolmap.CameraModelId.__members__) - {"INVALID", "EQUIRECTANGULAR"}
+    assert known == LENSES.keys()
+
+
+@pytest.mark.parametrize("model", LENSES)
+def test_cameras_given_back_make_the_same_views(model: str, tmp_path: Path) -> None:
+    """From a COLMAP model measured on other sizes than the photograph's and the working size."""
+    photos = [replace(photo, original_width=203, original_height=152) for photo in PHOTOS]
+    first = solve(photos, colmap_model(tmp_path, model), tmp_path)
+    again = solve_frames(photos, transforms_json(first, REGION), tmp_path)
+    assert again.lenses == first.lenses
+    assert {(lens.width, lens.height) for lens in first.lenses} == {(203, 152)}
+    for view, other in zip(first.views, again.views, strict=True):
+        np.testing.assert_allclose(
+            other.camera.camera_from_world, view.camera.camera_from_world, rtol=1e-9, atol=1e-12
+        )
+        np.testing.assert_array_equal(other.camera.intrinsics, view.camera.intrinsics)
+        np.testing.assert_array_equal(other.image_srgb, view.image_srgb)
+
+
+@pytest.mark.parametrize("model", LENSES)
+def test_the_file_says_what_the_lens_does(model: str, tmp_path: Path) -> None:
+    """The lens that is read projects as the one the file was made from, at the photograph's size."""
+    photos = [make_photo(photo.name, scale=2.5) for photo in PHOTOS]
+    first = solve(photos, colmap_model(tmp_path, model), tmp_path)
+    (frame, *_) = transforms_json(first, REGION)["frames"]
+    read = frame_lens(frame, photos[0])
+    lens = pycolmap.Camera(model=model, width=160, height=120, params=LENSES[model])
+    rays = np.add(np.random.default_rng(0).uniform(-0.4, 0.4, (50, 3)), [0, 0, 1])
+    np.testing.assert_allclose(read.img_from_cam(rays), lens.img_from_cam(rays), atol=1e-9)
+    assert (frame["w"], frame["h"]) == (160, 120)
+    assert frame["fl_x"] == pytest.approx(lens.focal_length_x)
+    assert ("colmap_params" in frame) is (model in WITHOUT_WORDS), "only where nerfstudio has no words"
+
+
+def test_a_panorama_is_refused(tmp_path: Path) -> None:
+    """It has no focal length, and pycolmap crashes where it is asked for one."""
+    photos = [make_photo(photo.name, scale=2.5) for photo in PHOTOS]
+    with pytest.raises(ReconstructionError, match="panorama") as caught:
+        solve(photos, colmap_model(tmp_path, "EQUIRECTANGULAR"), tmp_path)
+    assert caught.value.code == ErrorCode.CAMERAS_UNUSABLE
+
+
+def colmap_model(folder: Path, model: str) -> Path:
+    """A text model with one lens and three poses for PHOTOS."""
+    folder = folder / "colmap"
+    folder.mkdir()
+    params = " ".join(map(repr, LENSES.get(model, [160.0, 120.0])))
+    (folder / "cameras.txt").write_text(f"1 {model} 160 120 {params}\n")
+    lines = []
+    for index, photo in enumerate(PHOTOS, start=1):
+        x, y, z, w = Rotation.random(random_state=index).as_quat().tolist()
+        lines.append(f"{index} {w!r} {x!r} {y!r} {z!r} 0.1 {index}.2 0.3 1 {photo.name}\n\n")
+    (folder / "images.txt").write_text("".join(lines))
+    (folder / "points3D.txt").write_text("")
+    return folder
+
+
+def test_the_file_tells_more_than_readers_need(tmp_path: Path) -> None:
+    first = solve_frames(PHOTOS, {"frames": [FRAMES[0], FRAMES[2]]}, tmp_path)
+    assert transforms_json(first, REGION)["fewview"] == {
+        "estimated": False,
+        "reprojection_error_px": None,
+        "region": {"centre_world": pytest.approx([1.0, -2.0, 3.0]), "radius_world": pytest.approx(4.0)},
+        "unplaced": [{"name": "b.jpg", "why": "no camera in transforms.json has its name"}],
+    }
+
+
+def test_the_model_stands_at_the_top_where_all_share_it(tmp_path: Path) -> None:
+    fisheye = [frame | {"camera_model": "OPENCV_FISHEYE"} for frame in FRAMES]
+    for frames, model in (
+        (FRAMES, "PINHOLE"),
+        (fisheye, "OPENCV_FISHEYE"),
+        ([FRAMES[0], fisheye[1]], "PINHOLE"),
+    ):
+        written = transforms_json(solve_frames(PHOTOS, {"frames": frames}, tmp_path), REGION)
+        assert written["camera_model"] == model
+    assert [frame["camera_model"] for frame in written["frames"]] == ["PINHOLE", "OPENCV_FISHEYE"]
+
+
+@pytest.mark.parametrize(
+    ("model", "params", "words"),
+    [
+        ("NONE", [1.0], "none of COLMAP's models"),
+        ("INVALID", [1.0], "none of COLMAP's models"),
+        ("FOV", "1", "none of COLMAP's models"),
+        ("FOV", [100.0, 100.0, 30.0, 20.0, True], "none of COLMAP's models"),
+        ("FOV", [1.0], "too few or too many"),
+        ("EQUIRECTANGULAR", [64.0, 48.0], "too few or too many"),
+        ("FOV", [100.0, 100.0, 30.0, 20.0, float("nan")], "no usable number"),
+    ],
+)
+def test_colmap_s_words_are_checked(model: str, params: object, words: str, tmp_path: Path) -> None:
+    frame = FRAMES[0] | {"camera_model": model, "colmap_params": params}
+    with pytest.raises(ReconstructionError, match=words) as caught:
+        solve_frames(PHOTOS, {"frames": [FRAMES[1], frame]}, tmp_path)
+    assert caught.value.code == ErrorCode.CAMERAS_UNUSABLE
+    assert "a.jpg" in caught.value.text
 
 
 def test_poses_are_camera_to_world_with_opengl_axes(tmp_path: Path) -> None:
@@ -121,7 +249,7 @@ def test_applied_transform_is_no_part_of_the_poses(tmp_path: Path) -> None:
 def test_a_photograph_without_a_camera_is_left_out(tmp_path: Path) -> None:
     solved = solve_frames(PHOTOS, {"frames": [FRAMES[2], FRAMES[0]]}, tmp_path)
     assert [view.name for view in solved.views] == ["a.jpg", "c.jpg"]
-    assert solved.unplaced == ("b.jpg",)
+    assert solved.unplaced == (Unplaced(name="b.jpg", why="no camera in transforms.json has its name"),)
 
 
 def test_names_match_by_case_stem_and_folder() -> None:
@@ -239,7 +367,8 @@ def test_colmap_models_with_their_points(text: bool, below: str, tmp_path: Path)
     left_out, *photographed = sorted(names)
     photos = [make_photo(names[i], scale=10) for i in photographed] + [make_photo("other.jpg")]
     solved = solve(photos, tmp_path / "model", tmp_path)
-    assert solved.unplaced == ("other.jpg",)
+    assert [photo.name for photo in solved.unplaced] == ["other.jpg"]
+    assert "has its name" in solved.unplaced[0].why
     assert solved.reprojection_error_px is None
     for view, image_id in zip(solved.views, photographed, strict=True):
         expected = model.images[image_id].cam_from_world().matrix()

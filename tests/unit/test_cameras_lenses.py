@@ -14,6 +14,7 @@ from backend.stages.lenses import (
     SMALLEST_ZOOM,
     PlacedPhoto,
     is_pinhole,
+    photo_lens,
     rescaled_lens,
     smallest_filled_zoom_or_none,
     source_pixels,
@@ -139,3 +140,15 @@ def test_the_view_ends_before_the_lens_folds() -> None:
     radii = np.linalg.norm(sources - (80.0, 60.0), axis=-1)
     outwards = np.stack([radii[60 - step, 80 - step * 4 // 3] for step in range(0, 60, 3)])
     assert (np.diff(outwards) > 0).all()
+
+
+def test_each_side_scales_the_focal_length_along_it() -> None:
+    """A picture of 101x67 scaled to 50x33 is lowered less than narrowed; a lens follows both."""
+    lens = pycolmap.Camera(model="SIMPLE_RADIAL", width=101, height=67, params=[90.0, 50.0, 33.0, -0.1])
+    photo = replace(photograph(lens), original_width=50, original_height=33)
+    found = photo_lens(photo, placed(lens))
+    across, down = 50 / 101, 33 / 67
+    assert (found.model, found.width, found.height) == ("OPENCV", 50, 33)
+    np.testing.assert_allclose(
+        found.params, [90 * across, 90 * down, 50 * across, 33 * down, -0.1, 0, 0, 0], rtol=1e-12
+    )

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from backend.mesh_files import MeshFileError, read_mesh, write_glb, write_mesh, write_points
+from backend.mesh_files import MeshFileError, read_mesh, write_glb, write_mesh, write_points, write_sparse
 from backend.scene import Region, SurfaceMesh, SurfacePoints
 
 
@@ -69,6 +69,24 @@ def test_the_header_names_every_property_and_its_size(tmp_path: Path) -> None:
         *("uchar red", "uchar green", "uchar blue", "float support"),
         "list uchar int vertex_indices",
     ]
+
+
+@pytest.mark.parametrize("count", [0, 7])
+def test_sparse_points_are_positions_and_colours(tmp_path: Path, count: int) -> None:
+    random = np.random.default_rng(0)
+    positions, colours = random.normal(size=(count, 3)) + 5e6, random.integers(0, 256, (count, 3), np.uint8)
+    write_sparse(tmp_path / "sparse.ply", positions=positions, colours_srgb=colours)
+    header, _, body = (tmp_path / "sparse.ply").read_bytes().partition(b"end_header\n")
+    lines = header.decode("ascii").splitlines()
+    assert lines[:2] == ["ply", "format binary_little_endian 1.0"]
+    assert lines[3:] == [
+        f"element vertex {count}",
+        *(f"property double {axis}" for axis in "xyz"),
+        *(f"property uchar {channel}" for channel in ("red", "green", "blue")),
+    ]
+    rows = np.frombuffer(body, np.dtype([("xyz", "<f8", 3), ("rgb", "u1", 3)]))
+    np.testing.assert_array_equal(rows["xyz"], positions)
+    np.testing.assert_array_equal(rows["rgb"], colours)
 
 
 def test_the_same_mesh_gives_the_same_bytes(tmp_path: Path) -> None:

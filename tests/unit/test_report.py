@@ -25,7 +25,7 @@ from backend.report_page.wording import (
     percent_text,
     stage_text,
 )
-from backend.scene import SurfaceMesh, no_progress, transform_points
+from backend.scene import SurfaceMesh, Unplaced, no_progress, transform_points
 from backend.stages.report import (
     Report,
     ReportConfig,
@@ -170,6 +170,7 @@ def test_numbers_survive_json_and_say_their_units(measured: Report) -> None:
         "estimated": True,
         "num_placed": 3,
         "unplaced": ["IMG_4030.JPG"],
+        "unplaced_because": ["it shares no features with the others"],
         "reprojection_error_px": 0.47,
     }
     assert numbers["region"]["radius_world"] == pytest.approx(2.0)
@@ -226,7 +227,14 @@ def test_error_maps_are_dark_red_where_the_error_is_large(tmp_path: Path) -> Non
 def test_the_page_tells_everything(measured: Report) -> None:
     words = Page(render_report_html(measured)).words
     inputs = measured.inputs
-    expected = [inputs.job_name, *inputs.warnings, "IMG_4030.JPG", "0.47 pixels", "torch 2.13.0", "Seed 7"]
+    expected = [
+        inputs.job_name,
+        *inputs.warnings,
+        "IMG_4030.JPG no it shares no features",
+        "0.47 pixels",
+        "torch 2.13.0",
+        "Seed 7",
+    ]
     expected += [
         text for decision in inputs.decisions for text in (decision.what, decision.choice, decision.because)
     ]
@@ -252,10 +260,12 @@ def test_names_can_not_break_the_page() -> None:
     evil = '"><script>alert(1)</script>'
     inputs = replace(small_run(), job_name=evil, warnings=(evil,))
     views = (replace(inputs.solved.views[0], name=evil),)
-    inputs = replace(inputs, solved=replace(inputs.solved, views=views, unplaced=(evil,)))
+    inputs = replace(
+        inputs, solved=replace(inputs.solved, views=views, unplaced=(Unplaced(name=evil, why=evil),))
+    )
     page = Page(render_report_html(build_report(inputs, SMALL, progress=no_progress)))
     assert not page.all("script")
-    assert page.words.count(evil) == 6, "title, heading, warning, picture, two rows"
+    assert page.words.count(evil) == 7, "title, heading, warning, picture, two rows, a reason"
     assert page.all("img")[0]["alt"].count(evil) == 1
 
 

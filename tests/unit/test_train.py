@@ -15,9 +15,9 @@ from scipy.spatial import cKDTree
 from backend.errors import Cancelled
 from backend.maths.raycast import render_mesh
 from backend.scene import Progress, Region, SurfaceMesh, no_progress, transform_points
-from backend.stages.mesh import MeshConfig, extract_mesh, level_set
+from backend.stages.mesh import MeshConfig, extract_mesh, level_set, preview_mesh
 from backend.stages.stereo import StereoConfig, StereoResult, match_views
-from backend.stages.train import Surface, TrainConfig, fit_surface
+from backend.stages.train import ShowSurface, Surface, TrainConfig, fit_surface, show_nothing
 from tests.synthetic_scene import (
     CENTRE,
     SIZE,
@@ -46,10 +46,17 @@ def fitted(
     config: TrainConfig,
     seed: int = 0,
     progress: Progress = no_progress,
+    show: ShowSurface = show_nothing,
 ) -> Surface:
-    chance = torch.Generator().manual_seed(seed)
     return fit_surface(
-        scene.views, region, stereo, config, device=torch.device("cpu"), generator=chance, progress=progress
+        scene.views,
+        region,
+        stereo,
+        config,
+        device=torch.device("cpu"),
+        generator=torch.Generator().manual_seed(seed),
+        progress=progress,
+        show=show,
     )
 
 
@@ -198,6 +205,26 @@ def test_a_seed_repeats_to_the_bit_and_another_one_does_not() -> None:
     np.testing.assert_array_equal(first.distance, again.distance)
     np.testing.assert_array_equal(first.grid_from_world, again.grid_from_world)
     assert np.abs(first.distance - other.distance).max() > 0
+
+
+def test_unfinished_surfaces_are_shown_and_change_nothing() -> None:
+    """One for each level, each nearer to the truth; the last one is what rendering starts from."""
+    shown: list[Surface] = []
+    config = TrainConfig(levels=(16, 32), steps=(0, 3))
+    torch.use_deterministic_algorithms(True)
+    try:
+        seen = fitted(masked_scene(), true_region(), masked_stereo(), config, show=shown.append)
+        unseen = fitted(masked_scene(), true_region(), masked_stereo(), config)
+    finally:
+        torch.use_deterministic_algorithms(False)
+    assert seen.distance.tobytes() == unseen.distance.tobytes()
+    assert [len(surface.distance) for surface in shown] == [16, 32]
+    meshes = [preview_mesh(surface, np.zeros((0, 3)), np.zeros((0, 3), np.float32)) for surface in shown]
+    coarse, fine = (float(np.median(errors_percent(mesh.vertices))) for mesh in meshes if mesh is not None)
+    assert fine < coarse
+    assert fine < 0.5
+    moved = np.abs(shown[-1].distance - seen.distance).max()
+    assert 0 < moved < 2 / 31, "in the grid's units, a cell"
 
 
 def test_rendering_moves_the_surface_by_less_than_a_cell() -> None:

@@ -161,6 +161,18 @@ def test_cameras_look_at_the_middle_of_the_bounding_box(kind: LayoutKind) -> Non
 
 
 @pytest.mark.parametrize("kind", KINDS)
+def test_a_given_distance_is_kept(kind: LayoutKind) -> None:
+    points = some_points()
+    centre = (points.min(axis=0) + points.max(axis=0)) / 2
+    exact = place_cameras(layout(kind, jitter=0.0), LENS, points=points, distance=3.0)
+    np.testing.assert_allclose(np.linalg.norm(exact[:, :3, 3] - centre, axis=1), 3.0)
+    shaken = place_cameras(layout(kind), LENS, points=points, distance=3.0)
+    distances = np.linalg.norm(shaken[:, :3, 3] - centre, axis=1)
+    assert (distances >= 3.0 - 1e-9).all()
+    assert (distances <= 3.0 * 1.06 + 1e-9).all()
+
+
+@pytest.mark.parametrize("kind", KINDS)
 def test_jitter_stays_small(kind: LayoutKind) -> None:
     points, centre = some_points(), (some_points().min(axis=0) + some_points().max(axis=0)) / 2
     exact = place_cameras(layout(kind, jitter=0.0), LENS, points=points)[:, :3, 3] - centre

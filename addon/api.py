@@ -1,0 +1,84 @@
+"""From photographs to a mesh in the scene with one function, for scripts.
+
+from bl_ext.user_default.fewview.addon.api import reconstruct
+
+result = reconstruct(["photos"], output="jobs")
+print(result.mesh.name, result.folder)
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import bpy
+
+from ..backend.wire.protocol import PROTOCOL_VERSION, Failed, Job
+from . import jobs
+from .job_folder import RESULT, new_folder
+from .operators.environment import backend_python_or_reason
+from .operators.reconstruct import start
+from .properties import settings_of
+
+
+class ReconstructionFailed(RuntimeError):  # noqa: N818 - it says what happened
+    """The backend could not make a mesh; `failure` has a code, a sentence and a remedy."""
+
+    def __init__(self, failure: Failed) -> None:
+        super().__init__(f"{failure.text} {failure.remedy}".strip())
+        self.failure = failure
+
+
+@dataclass(frozen=True, kw_only=True)
+class Reconstruction:
+    """What came of it."""
+
+    mesh: bpy.types.Object
+    folder: Path
+    """Of the job; `folder / "result" / "report.html"` shows how good it is."""
+    warnings: tuple[str, ...]
+
+
+def reconstruct(
+    images: Sequence[Path | str],
+    *,
+    output: Path | str,
+    cameras: Path | str | None = None,
+    masks: Path | str | None = None,
+    truth: Path | str | None = None,
+    preset: str = "balanced",
+    device: str = "auto",
+    seed: int = 0,
+    region: tuple[tuple[float, float, float], float] | None = None,
+) -> Reconstruction:
+    """Reconstruct from image files or folders, wait, and bring the mesh into the scene.
+
+    The job gets a folder of its own in `output`. `cameras` are known ones: a transforms.json or a COLMAP
+    model; `region` is a centre and a radius in their frame. Raises JobError where nothing can be started,
+    ValueError for arguments that make no sense, ReconstructionFailed where the backend gives up.
+    """
+    python, reason = backend_python_or_reason(bpy.context)
+    if python is None:
+        raise jobs.JobError(reason)
+    asked = Job(
+        protocol=PROTOCOL_VERSION,
+        images=tuple(str(Path(path).absolute()) for path in images),
+        output=RESULT,
+        cameras=_absolute(cameras),
+        masks=_absolute(masks),
+        truth=_absolute(truth),
+        preset=preset,
+        device=device,
+        seed=seed,
+        region_centre=None if region is None else tuple(map(float, region[0])),
+        region_radius=None if region is None else float(region[1]),
+    )
+    folder = new_folder(Path(output).absolute(), "reconstruct")
+    start(python, folder, asked, scene_name=bpy.context.scene.name)
+    end = jobs.wait()
+    if end.failure is not None:
+        raise ReconstructionFailed(end.failure)
+    return Reconstruction(mesh=settings_of(bpy.context).result, folder=folder, warnings=end.warnings)
+
+
+def _absolute(path: Path | str | None) -> str | None:
+    return None if path is None else str(Path(path).absolute())

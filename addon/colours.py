@@ -1,0 +1,110 @@
+"""How a result's colours, its support and its error are shown in the viewport and in renders.
+
+A mesh has one colour attribute per way of showing it. Solid mode and the material both follow the active
+one: the material's node has no layer name, which means the attribute that is marked for rendering.
+"""
+
+import bpy
+import numpy as np
+
+from .heat_map import ERROR, SUPPORT, HeatMap, heat_colours
+
+COLOUR = "Color"
+"""Name of the colour attribute that a result comes with."""
+KINDS = ("COLOUR", "SUPPORT", "ERROR")
+_HEAT_MAPS = {"SUPPORT": SUPPORT, "ERROR": ERROR}
+_MISSING = {
+    "COLOUR": "This mesh has no colors: import the result again",
+    "SUPPORT": "This mesh does not know its support: import the result again",
+    "ERROR": "The error is not known yet: press Measure Error first",
+}
+
+
+def make_material(name: str, mean_linear: tuple[float, float, float]) -> bpy.types.Material:
+    """A rough material without highlights that shows the mesh's colour attribute marked for rendering."""
+    material = bpy.data.materials.new(name)
+    if material.node_tree is None:  # from 5.0 on there is one from the start
+        material.use_nodes = True
+    nodes, links = material.node_tree.nodes, material.node_tree.links
+    nodes.clear()
+    output = nodes.new("ShaderNodeOutputMaterial")
+    surface = nodes.new("ShaderNodeBsdfPrincipled")
+    colours = nodes.new("ShaderNodeVertexColor")
+    colours.layer_name = ""
+    surface.inputs["Roughness"].default_value = 1.0
+    surface.inputs["Specular IOR Level"].default_value = 0.0
+    links.new(colours.outputs["Color"], surface.inputs["Base Color"])
+    links.new(surface.outputs["BSDF"], output.inputs["Surface"])
+    surface.location, output.location, colours.location = (0, 0), (300, 0), (-220, 0)
+    material.diffuse_color = (*mean_linear, 1.0)
+    material.roughness, material.specular_intensity = 1.0, 0.0
+    return material
+
+
+def can_show(mesh: bpy.types.Mesh, kind: str) -> bool:
+    """Whether the mesh has what `kind`, one of KINDS, shows."""
+    if kind == "COLOUR":
+        return _colours_or_none(mesh, COLOUR) is not None
+    return _values_or_none(mesh, _HEAT_MAPS[kind]) is not None
+
+
+def shown(mesh: bpy.types.Mesh) -> str:
+    """Which of KINDS the mesh shows; empty for an attribute of the user's own."""
+    active = mesh.color_attributes.active_color
+    names = {COLOUR: "COLOUR", **{heat.colours: kind for kind, heat in _HEAT_MAPS.items()}}
+    return "" if active is None else names.get(active.name, "")
+
+
+def legend(mesh: bpy.types.Mesh) -> str:
+    """What the colours mean that the mesh shows, in a line; empty for its own colours."""
+    heat = _HEAT_MAPS.get(shown(mesh))
+    return "" if heat is None else heat.legend
+
+
+def show(mesh: bpy.types.Mesh, kind: str) -> None:
+    """Show the mesh's own colours, its support or its error, in the viewport and in renders.
+
+    Raises ValueError, in a sentence for the user, where the mesh has no such values or is being edited.
+    """
+    if mesh.is_editmode:
+        raise ValueError("The mesh is being edited: leave Edit Mode first")
+    if not can_show(mesh, kind):
+        raise ValueError(_MISSING[kind])
+    name = COLOUR if kind == "COLOUR" else _draw(mesh, _HEAT_MAPS[kind])
+    index = mesh.color_attributes.find(name)
+    mesh.color_attributes.active_color_index = index
+    mesh.color_attributes.render_color_index = index
+    mesh.update_tag()
+
+
+def show_in_viewports() -> None:
+    """Have solid mode show colour attributes, in 3D viewports that show materials' colours."""
+    for window in bpy.context.window_manager.windows:
+        for area in window.screen.areas:
+            if area.type == "VIEW_3D" and area.spaces.active.shading.color_type == "MATERIAL":
+                area.spaces.active.shading.color_type = "VERTEX"
+
+
+def _draw(mesh: bpy.types.Mesh, heat: HeatMap) -> str:
+    """Colour the mesh by an attribute; the name of the colour attribute."""
+    found = _values_or_none(mesh, heat)
+    assert found is not None
+    values = np.empty(len(found.data), np.float32)
+    found.data.foreach_get("value", values)
+    colours = _colours_or_none(mesh, heat.colours)
+    if colours is None:
+        colours = mesh.color_attributes.new(heat.colours, "BYTE_COLOR", "POINT")
+    colours.data.foreach_set("color_srgb", heat_colours(heat, values).ravel())
+    return str(colours.name)
+
+
+def _values_or_none(mesh: bpy.types.Mesh, heat: HeatMap) -> bpy.types.Attribute | None:
+    found = mesh.attributes.get(heat.attribute)
+    if found is None or found.data_type != "FLOAT" or found.domain != "POINT":
+        return None
+    return found
+
+
+def _colours_or_none(mesh: bpy.types.Mesh, name: str) -> bpy.types.Attribute | None:
+    found = mesh.color_attributes.get(name)
+    return found if found is not None and found.domain == "POINT" else None

@@ -1,0 +1,167 @@
+"""How what was solved from photographs stands in the scene; numpy, no Blender needed.
+
+Estimated cameras have a frame of their own: any direction may be up, and any length one. Transforms are
+similarities, 4x4 float64, and cameras have Blender's axes (x right, y up, looking along -z).
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+_CERTAIN, _UNCERTAIN = 0.02, 0.002
+"""Spread of the cameras' x axes (second eigenvalue of their mean outer product): that of an arc of 28
+degrees, from which on they alone say what is level, and of 9 degrees, where they say nothing."""
+_RESIDUALS = (0.5, 0.35, 0.25, 0.17, 0.12, 0.1, 0.1, 0.1)
+"""Sines of the roll at which a camera counts a quarter, from a first look to the last."""
+_TIE = 1e-3
+"""Of the backwards axes beside the y axes: decides for cameras that look straight down."""
+_FEWEST_POINTS = 20
+_LOW = 0.02
+"""Share of points that may lie under the floor: they are the wrong ones."""
+
+
+def upright_from_solved(
+    world_from_camera: Array, centre: Array, radius: float, *, points: Array | None = None
+) -> Array:
+    """(4, 4): similarity that puts what was solved upright into Blender's world.
+
+    `world_from_camera` (cameras, 4, 4), `centre` (3,) and `radius` of the region and the sparse points
+    (points, 3) are in the frame that was solved. There the photographers' horizon becomes level, their
+    mean view looks along +y (the thing shows its front in Blender's front view), the region's radius is
+    1 m and its centre lies above the origin. The floor, z = 0, is where the lowest points of the region
+    are, but for 2 %; without enough points it is the region's lowest point.
+    Raises ValueError where there is no camera or a number is unusable.
+    """
+    poses, middle = np.asarray(world_from_camera, np.float64), np.asarray(centre, np.float64)
+    if poses.ndim != 3 or poses.shape[1:] != (4, 4) or not len(poses) or not np.isfinite(poses).all():
+        raise ValueError("no usable cameras to place the scene by")
+    if middle.shape != (3,) or not np.isfinite(middle).all() or not 0 < radius < np.inf:
+        raise ValueError(f"the region at {centre} with radius {radius} is not usable")
+    up = up_direction(poses)
+    forward = _front(poses, up)
+    rotation = np.stack([np.cross(forward, up), forward, up])
+    upright = np.eye(4)
+    upright[:3, :3] = rotation / radius
+    upright[:3, 3] = -rotation @ middle / radius
+    upright[2, 3] -= _floor(upright, points)
+    return upright
+
+
+def up_direction(world_from_camera: Array) -> Array:
+    """(3,): unit vector of the world that is up, for photographs held upright with a level horizon.
+
+    However a level camera is tilted, its x axis is horizontal. So up is the unit vector u with the least
+    sum of w_i (x_i . u)^2, where w_i = (s^2 / (s^2 + (x_i . u)^2))^2 lets a camera that was held in
+    another way than the others count little (Geman and McClure's weights, s falling from 0.5 to 0.1). Its
+    sign is that of the median of the y axes. Where the x axes are nearly parallel, which leaves u free
+    to turn about them, this median decides that, too; in between both have a share.
+    """
+    rotations = np.asarray(world_from_camera, np.float64)[:, :3, :3]
+    rotations = rotations / np.linalg.norm(rotations, axis=1, keepdims=True)
+    x_axes, y_axes, backwards = np.moveaxis(rotations, 2, 0)
+    top = _median_direction(y_axes)
+    up = top
+    for scale in _RESIDUALS:
+        weights = (scale**2 / (scale**2 + (x_axes @ up) ** 2)) ** 2
+        spread, axes = np.linalg.eigh(np.einsum("n,ni,nj->ij", weights / weights.sum(), x_axes, x_axes))
+        share = np.clip((_CERTAIN - spread[1]) / (_CERTAIN - _UNCERTAIN), 0.0, 1.0)
+        along = axes.T @ (top + _TIE * backwards.mean(axis=0)) * [1.0, share, 0.0]
+        up = axes @ along / np.linalg.norm(along)
+    return up
+
+
+def region_in_solved(
+    world_from_solved: Array, world_from_empty: Array, display_size: float
+) -> tuple[Array, float]:
+    """Centre (3,) and radius, in the solved frame, of the sphere that an empty shows.
+
+    The largest of the empty's three scales counts: what its sphere holds is always held.
+    Raises ValueError where the empty has no extent or one of the transforms cannot be turned back.
+    """
+    solved_from_world = inverse_similarity(world_from_solved)
+    solved_from_empty = solved_from_world @ np.asarray(world_from_empty, np.float64)
+    if not np.isfinite(solved_from_empty).all():
+        raise ValueError("the region stands nowhere: a number of its transform is not finite")
+    # Not the columns' lengths: a sheared empty (a child of a scaled one) is longer between its axes.
+    radius = abs(display_size) * float(np.linalg.norm(solved_from_empty[:3, :3], ord=2))
+    if not 0 < radius < np.inf:
+        raise ValueError("the region has no size")
+    return solved_from_empty[:3, 3].copy(), radius
+
+
+def inverse_similarity(b_from_a: Array) -> Array:
+    """(4, 4): the way back. Raises ValueError where the transform is none or flattens everything."""
+    matrix = np.asarray(b_from_a, np.float64)
+    if matrix.shape != (4, 4) or not np.isfinite(matrix).all() or abs(np.linalg.det(matrix)) < 1e-30:
+        raise ValueError("the placement cannot be turned back: one of its scales is 0")
+    return np.linalg.inv(matrix)
+
+
+def sphere_around(points: Array, weights: Array | None = None) -> tuple[Array, float]:
+    """Centre (3,) and radius of a sphere around what most points (points, 3) belong to.
+
+    Far points, as of a background, are left out: those more than three times as far from the weighted
+    median as the weighted median distance. The centre is the middle between the 2 % and the 98 %
+    quantile along each axis, the radius 5 % more than the 98 % quantile of the distance from there.
+    Raises ValueError where there are too few points or they have no extent.
+    """
+    points = np.asarray(points, np.float64)
+    weights = np.ones(len(points)) if weights is None else np.asarray(weights, np.float64)
+    good = np.isfinite(points).all(axis=1) & np.isfinite(weights) & (weights > 0)
+    points, weights = points[good], weights[good]
+    if len(points) < _FEWEST_POINTS:
+        raise ValueError(f"{len(points)} points are too few to fit a region to")
+    median = np.array([weighted_quantile(axis, weights, 0.5) for axis in points.T])
+    distances = np.linalg.norm(points - median, axis=1)
+    near = distances <= 3 * weighted_quantile(distances, weights, 0.5)
+    points, weights = points[near], weights[near]
+    centre = np.array(
+        [sum(weighted_quantile(axis, weights, share) for share in (_LOW, 1 - _LOW)) / 2 for axis in points.T]
+    )
+    radius = 1.05 * weighted_quantile(np.linalg.norm(points - centre, axis=1), weights, 1 - _LOW)
+    if not radius > 0:
+        raise ValueError("the points lie all in one place")
+    return centre, radius
+
+
+def weighted_quantile(values: Array, weights: Array, share: float) -> float:
+    """The smallest value such that values up to it have at least this share of the weight."""
+    order = np.argsort(values)
+    reached = np.cumsum(weights[order])
+    return float(values[order[min(np.searchsorted(reached, share * reached[-1]), len(order) - 1)]])
+
+
+def _front(world_from_camera: Array, up: Array) -> Array:
+    """(3,): the level unit vector along which the cameras look.
+
+    A full ring of cameras looks along none: then the first one decides, and where it looks straight up
+    or down, its picture's top, or its right side for a camera on its side.
+    """
+    first = world_from_camera[0]
+    for direction in (-world_from_camera[:, :3, 2].mean(axis=0), -first[:3, 2], first[:3, 1]):
+        level = direction - up * (direction @ up)
+        length = float(np.linalg.norm(level))
+        if length > 0.05:
+            return np.asarray(level / length)
+    level = np.cross(up, first[:3, 0])
+    return np.asarray(level / np.linalg.norm(level))
+
+
+def _floor(upright_from_solved: Array, points: Array | None) -> float:
+    """Height of the floor where the region is the unit sphere around the origin."""
+    if points is None or not len(points):
+        return -1.0
+    placed = np.asarray(points, np.float64) @ upright_from_solved[:3, :3].T + upright_from_solved[:3, 3]
+    heights = placed[np.linalg.norm(placed, axis=1) <= 1.0, 2]
+    return float(np.quantile(heights, _LOW)) if len(heights) >= _FEWEST_POINTS else -1.0
+
+
+def _median_direction(directions: Array) -> Array:
+    """(3,): unit vector to the geometric median (Weiszfeld's iteration); not moved by a few outliers."""
+    median = directions.mean(axis=0)
+    for _ in range(50):
+        nearness = 1.0 / np.maximum(np.linalg.norm(directions - median, axis=1), 1e-6)
+        median = (nearness[:, None] * directions).sum(axis=0) / nearness.sum()
+    length = float(np.linalg.norm(median))
+    return np.asarray(median / length) if length > 1e-6 else directions[0]

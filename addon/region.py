@@ -1,0 +1,151 @@
+"""The sphere around what is to be reconstructed: an empty of the scene, and the best guess where it is."""
+
+from pathlib import Path
+
+import bpy
+import numpy as np
+from mathutils import Matrix
+from numpy.typing import NDArray
+
+from .camera_objects import JOB, POINTS, ROLE
+from .job_folder import CAMERAS, RESULT, inside
+from .placing import region_in_solved, sphere_around
+from .solved import read_solved
+from .true_mesh import bounding_sphere, subject_of, true_mesh
+
+REGION = "region"
+"""Value of `fewview_role`."""
+_MARGIN = 1.05
+Sphere = tuple[NDArray[np.float64], float]
+"""Centre (3,) and radius."""
+
+
+def region_or_none(scene: bpy.types.Scene) -> bpy.types.Object | None:
+    """The empty, if the scene has one."""
+    return _of_scene(scene, scene.fewview.region)
+
+
+def region_of(scene: bpy.types.Scene) -> Sphere | None:
+    """The region in the solved frame, as a job wants it; None to have the backend find it.
+
+    Raises ValueError where the empty has no size or the placement cannot be turned back.
+    """
+    empty = region_or_none(scene)
+    if empty is None:
+        return None
+    return region_in_solved(world_from_root(scene), np.array(empty.matrix_world), empty.empty_display_size)
+
+
+def world_from_root(scene: bpy.types.Scene) -> NDArray[np.float64]:
+    """(4, 4) similarity `world_from_solved` of the scene; the identity where cameras are known."""
+    root = _of_scene(scene, scene.fewview.root)
+    return np.eye(4) if root is None else np.array(root.matrix_world, np.float64)
+
+
+def place_region(scene: bpy.types.Scene, sphere: Sphere) -> bpy.types.Object:
+    """Move the scene's region to this sphere in the world; made where there is none."""
+    centre, radius = sphere
+    empty = region_or_none(scene)
+    if empty is None:
+        empty = bpy.data.objects.new("FewView Region", None)
+        empty[ROLE] = REGION
+        scene.collection.objects.link(empty)
+        empty.empty_display_type = "SPHERE"
+        scene.fewview.region = empty
+    # In units of what it shows, so that its scale reads as the radius.
+    empty.empty_display_size = 1.0
+    empty.matrix_world = Matrix.Translation(centre.tolist()) @ Matrix.Scale(radius, 4)
+    return empty
+
+
+def remove_region(scene: bpy.types.Scene) -> None:
+    """Forget the region; the empty goes if it is one of ours."""
+    empty = scene.fewview.region
+    scene.fewview.region = None
+    if empty is not None and empty.get(ROLE) == REGION and empty.type == "EMPTY":
+        bpy.data.objects.remove(empty)
+
+
+def guess(scene: bpy.types.Scene) -> tuple[Sphere, str]:
+    """The sphere that the backend found, or else around the target, or else at the cursor; and which."""
+    for sphere, source in ((_backend_sphere(scene), "the cameras"), (_target_sphere(scene), "the object")):
+        if sphere is not None:
+            return sphere, source
+    return (np.array(scene.cursor.location, np.float64), 1.0), "the 3D cursor"
+
+
+def fitted(scene: bpy.types.Scene) -> tuple[Sphere, str]:
+    """The sphere around the sparse points, or that of the backend, or around the target; and which.
+
+    Raises ValueError where there is nothing to fit to.
+    """
+    points = _points_or_none(scene)
+    if points is not None:
+        try:
+            return sphere_around(*points), "the points"
+        except ValueError:
+            pass  # too few, or all in one place: the next best
+    for sphere, source in ((_backend_sphere(scene), "the cameras"), (_target_sphere(scene), "the object")):
+        if sphere is not None:
+            return sphere, source
+    raise ValueError("There is nothing to fit the region to: estimate the cameras first, or choose an object")
+
+
+def _of_scene(scene: bpy.types.Scene, made: bpy.types.Object | None) -> bpy.types.Object | None:
+    """A pointer keeps an object that the user has deleted from the scene."""
+    return made if made is not None and scene.objects.get(made.name) == made else None
+
+
+def _job(scene: bpy.types.Scene) -> str:
+    """Folder of the job that the scene's cameras come from; empty where there is none."""
+    root = _of_scene(scene, scene.fewview.root)
+    if root is not None and root.get(JOB):
+        return str(root[JOB])
+    return bpy.path.abspath(scene.fewview.cameras_job) if scene.fewview.cameras_job else ""
+
+
+def _points_or_none(scene: bpy.types.Scene) -> tuple[NDArray[np.float64], NDArray[np.float64] | None] | None:
+    """Sparse points (points, 3) in the world and, where they have any, their weights."""
+    found = [made for made in scene.objects if made.get(ROLE) == POINTS and made.type == "MESH"]
+    job = _job(scene)
+    chosen = next((made for made in found if made.get(JOB) == job), found[-1] if found else None)
+    if chosen is None:
+        return None
+    mesh = chosen.data
+    flat = np.empty(3 * len(mesh.vertices), np.float32)
+    mesh.vertices.foreach_get("co", flat)
+    world = np.array(chosen.matrix_world, np.float64)
+    weights = None
+    confidence = mesh.attributes.get("confidence") or mesh.attributes.get("support")
+    if confidence is not None and confidence.data_type == "FLOAT" and confidence.domain == "POINT":
+        weights = np.empty(len(mesh.vertices), np.float32)
+        confidence.data.foreach_get("value", weights)
+    return flat.reshape(-1, 3) @ world[:3, :3].T + world[:3, 3], weights
+
+
+def _backend_sphere(scene: bpy.types.Scene) -> Sphere | None:
+    """What the backend found with the cameras, in the world."""
+    folder = _job(scene)
+    if not folder:
+        return None
+    try:
+        solved = read_solved(inside(Path(folder), Path(folder) / RESULT / CAMERAS))
+    except ValueError:  # no such job any more: the next best guess
+        return None
+    if solved.region_centre is None or solved.region_radius is None:
+        return None
+    world = world_from_root(scene)
+    scale = float(np.cbrt(abs(np.linalg.det(world[:3, :3]))))
+    return world[:3, :3] @ np.array(solved.region_centre) + world[:3, 3], solved.region_radius * scale
+
+
+def _target_sphere(scene: bpy.types.Scene) -> Sphere | None:
+    """Around the object that the views were rendered of."""
+    target = _of_scene(scene, scene.fewview.target)
+    if target is None:
+        return None
+    try:
+        centre, radius = bounding_sphere(true_mesh(subject_of(target)))
+    except ValueError:  # hidden, or without a surface
+        return None
+    return (centre, radius * _MARGIN) if radius > 0 else None

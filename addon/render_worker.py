@@ -1,0 +1,167 @@
+"""Rendering in a second Blender, so that the first stays free: how it is started, and what it does.
+
+It opens a copy of the .blend, removes that copy, renders, and says on the wire how far it is.
+"""
+
+import os
+import platform
+import sys
+import threading
+import time
+from collections.abc import Callable
+from contextlib import closing
+from pathlib import Path
+
+import bpy
+
+from ..backend.commands.cancelling import EXIT_CANCELLED, GRACE_S, CancelRequest, watch_stdin
+from ..backend.errors import Cancelled
+from ..backend.version import VERSION
+from ..backend.wire.protocol import (
+    CANCELLED,
+    PROTOCOL_VERSION,
+    Failed,
+    Finished,
+    Hello,
+    Message,
+    Progress,
+    Stage,
+    Warned,
+)
+from ..backend.wire.speaker import Speaker, speaker
+from .view_rendering import ViewRequest, decode_request, encode_request, render_views
+
+COPY, REQUEST, LOG = "scene.blend", "request.json", "render.log"
+STAGE = "render"
+RENDER_FAILED = "render_failed"
+"""Code of a failure."""
+
+
+def needs_waiting() -> bool:
+    """Whether there is no second Blender to render in, or no window to keep free."""
+    return bpy.app.background or not bpy.app.binary_path
+
+
+def prepare(scene: bpy.types.Scene, request: ViewRequest, folder: Path) -> None:
+    """Write what the second Blender reads: the request, and the scene with all that it uses.
+
+    Not by saving a copy of the file: Blender then takes the user's unsaved changes for saved.
+    Raises RuntimeError or OSError where the copy cannot be written.
+    """
+    (folder / REQUEST).write_text(encode_request(request), encoding="utf-8")
+    if bpy.ops.ed.flush_edits.poll():
+        bpy.ops.ed.flush_edits()  # what is being edited or sculpted
+    blocks = {scene, *bpy.data.texts}  # drivers may call what a text defines
+    bpy.data.libraries.write(str(folder / COPY), blocks, path_remap="ABSOLUTE", compress=False)
+
+
+def clean(folder: Path) -> None:
+    """Remove what `prepare` wrote, if the second Blender has not come that far."""
+    for name in (COPY, REQUEST):
+        (folder / name).unlink(missing_ok=True)
+
+
+def worker_command(folder: Path) -> tuple[str, ...]:
+    """The command that renders a prepared folder, to be started with this process's environment."""
+    script = f"import importlib; importlib.import_module({__name__!r}).main({str(folder)!r})"
+    return (
+        *(bpy.app.binary_path, "--background", str(folder / COPY)),
+        *("--python-exit-code", "1", "--python-expr", script),
+    )
+
+
+def render_here(request: ViewRequest, folder: Path) -> None:
+    """Render in this Blender, with progress on stderr. Raises as `render_views` does."""
+    with closing(render_views(request, folder)) as views:
+        for index, _ in views:
+            sys.stderr.write(f"FewView: {_view_of(index + 1, request)}\n")
+
+
+def unsaved_images() -> tuple[str, ...]:
+    """Painted images that are nowhere but in this Blender's memory: a copy of the file does not have them."""
+    return tuple(image.name for image in bpy.data.images if image.is_dirty and image.packed_file is None)
+
+
+def main(folder: str) -> None:
+    """What the second Blender does: the whole conversation."""
+    asked, last_word = CancelRequest(), threading.Lock()
+    with speaker() as speaking:
+
+        def end_with(message: Message) -> bool:
+            """Say the last word, unless another thread has said it."""
+            if not last_word.acquire(blocking=False):
+                return False
+            speaking.silence()
+            speaking.say(message)
+            return True
+
+        hello = Hello(
+            protocol=PROTOCOL_VERSION, backend=VERSION, python=platform.python_version(), pid=os.getpid()
+        )
+        speaking.say(hello)
+        watch_stdin(asked)
+        threading.Thread(target=_end_when_asked, args=(asked, end_with), daemon=True).start()
+        end_with(_render(Path(folder), asked, speaking))
+
+
+def _end_when_asked(asked: CancelRequest, end_with: Callable[[Message], bool]) -> None:
+    """Between two views the main thread ends by itself; a view that takes long is not waited for."""
+    while not asked.is_asked:
+        time.sleep(0.05)
+    time.sleep(GRACE_S)
+    if end_with(_cancelled()):
+        os._exit(EXIT_CANCELLED)
+
+
+def _render(folder: Path, asked: CancelRequest, speaking: Speaker) -> Message:
+    """Render all views; the last word."""
+    speaking.say(Stage(name=STAGE, index=1, count=1))
+    try:
+        request = _take_over(folder)
+        if bpy.app.autoexec_fail:
+            text = "Python in this file was not run for the views, as Auto Run Python Scripts is off"
+            speaking.say(Warned(text=text))
+        return _say_views(request, folder, asked, speaking)
+    except Cancelled:
+        return _cancelled()
+    except (ValueError, TypeError, KeyError, AttributeError, OSError, RuntimeError, MemoryError) as error:
+        text = f"The views could not be rendered: {error}"
+        return Failed(code=RENDER_FAILED, text=text, remedy="The log says more.")
+
+
+def _take_over(folder: Path) -> ViewRequest:
+    """What is to be rendered; from now on nothing but Blender's memory holds the copy of the file."""
+    request = decode_request((folder / REQUEST).read_text(encoding="utf-8"))
+    if not bpy.data.filepath or not os.path.samefile(bpy.data.filepath, folder / COPY):
+        raise ValueError("Blender did not open the copy of the scene")
+    clean(folder)
+    scene = next((scene for scene in bpy.data.scenes if scene.name_full == request.scene), None)
+    if scene is None or request.view_layer not in scene.view_layers:
+        raise ValueError(f"{request.scene}, {request.view_layer} is not in the copy of the scene")
+    window = bpy.context.window_manager.windows[0]
+    window.scene, window.view_layer = scene, scene.view_layers[request.view_layer]
+    return request
+
+
+def _say_views(request: ViewRequest, folder: Path, asked: CancelRequest, speaking: Speaker) -> Message:
+    started_s, count = time.monotonic(), len(request.views)
+    speaking.say(Progress(stage=STAGE, fraction=0.0, text=_view_of(1, request), remaining_s=None))
+    files: list[str] = []
+    with closing(render_views(request, folder)) as views:
+        for index, path in views:
+            asked.check()
+            done = index + 1
+            files.append(path.relative_to(folder).as_posix())
+            remaining_s = (time.monotonic() - started_s) / done * (count - done)
+            text = _view_of(min(done + 1, count), request)
+            speaking.say(Progress(stage=STAGE, fraction=done / count, text=text, remaining_s=remaining_s))
+    return Finished(output=str(folder), files=(*files, "transforms.json"))
+
+
+def _view_of(number: int, request: ViewRequest) -> str:
+    return f"view {number} of {len(request.views)}"
+
+
+def _cancelled() -> Failed:
+    text = "The rendering was stopped; the views that were finished stay in their folder."
+    return Failed(code=CANCELLED, text=text, remedy="")

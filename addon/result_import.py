@@ -1,0 +1,77 @@
+"""The result of a job on disk in the scene: its mesh, and the cameras and points it was made from."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import bpy
+import numpy as np
+from numpy.typing import NDArray
+
+from . import undo_step
+from .camera_objects import CameraImport, import_steps, read_import, root_or_none
+from .job_folder import CAMERAS, MESH, PastJob, inside, read_job
+from .mesh_import import MeshImport, import_mesh, read_in_steps, scene_named
+from .placing import upright_from_solved
+from .solved import SolvedScene
+
+
+def import_result_steps(
+    folder: Path, *, scene_name: str, cameras: bool = True, undo: bool = True
+) -> Iterator[None]:
+    """Import the mesh of a job, and its cameras, in steps short enough for a timer, as one undo step.
+
+    Give `undo` False where an operator makes the undo step itself. The mesh is read first: where it
+    cannot be used, the scene is left as it is. Raises FolderError, ValueError or OSError with a sentence
+    for the user.
+    """
+    job = read_job(folder)
+    mesh = yield from read_in_steps(inside(job.folder, job.result / MESH))
+    found = _cameras_or_none(job)
+    yield
+    if cameras and found is not None:
+        yield from import_steps(scene_name, found)
+    solved = None if found is None else found.solved
+    scene = scene_named(scene_name)
+    root = None if solved is None or not solved.estimated else _root_or_none(scene, job)
+    wanted = MeshImport(
+        job=str(job.folder.absolute()),
+        scene_name=scene_name,
+        world_from_solved=world_from_solved(scene, job, solved),
+        parent_uid=None if root is None else root.session_uid,
+    )
+    yield from import_mesh(mesh, wanted)
+    if undo:
+        undo_step.push(f"Import {job.folder.name}")
+
+
+def world_from_solved(
+    scene: bpy.types.Scene, job: PastJob, solved: SolvedScene | None
+) -> NDArray[np.float64]:
+    """(4, 4): where the job's frame lies in the scene.
+
+    Known cameras stand in the world already. Estimated ones are placed by their root, which the user may
+    have moved, or upright where there is none.
+    """
+    if solved is None or not solved.estimated:
+        return np.eye(4)
+    root = _root_or_none(scene, job)
+    if root is not None:
+        return np.array(root.matrix_world, np.float64)
+    if solved.region_centre is None or solved.region_radius is None:
+        return np.eye(4)
+    return upright_from_solved(solved.poses, np.array(solved.region_centre), solved.region_radius)
+
+
+def _root_or_none(scene: bpy.types.Scene, job: PastJob) -> bpy.types.Object | None:
+    """The job's own root, or else the one that the scene's settings name."""
+    chosen = scene.fewview.root
+    return root_or_none(scene, str(job.folder.absolute())) or (
+        chosen if chosen in scene.objects.values() else None
+    )
+
+
+def _cameras_or_none(job: PastJob) -> CameraImport | None:
+    """The job's cameras and points, as far as there are any."""
+    if not inside(job.folder, job.result / CAMERAS).is_file():
+        return None
+    return read_import(job.folder, tuple(job.folder / image for image in job.job.images))

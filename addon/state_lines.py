@@ -1,0 +1,81 @@
+"""The state of each step in one line: an icon and a few words."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import bpy
+
+from .job_folder import CAMERAS, RESULT
+from .operators.images import list_problems
+from .properties import FEWVIEW_PG_settings
+from .solved import SolvedScene, read_solved
+
+READY, TODO, TROUBLE = "CHECKMARK", "RADIOBUT_OFF", "ERROR"
+
+
+@dataclass(frozen=True, kw_only=True)
+class StepState:
+    """How a step stands."""
+
+    icon: str
+    text: str
+
+
+def images_state(settings: FEWVIEW_PG_settings) -> StepState:
+    """Step 1."""
+    num_used = sum(image.use for image in settings.images)
+    if not settings.images:
+        return StepState(icon=TODO, text="No photographs yet")
+    if num_used < 2 or any(image.use and "missing" in image.problem for image in settings.images):
+        return StepState(icon=TROUBLE, text=f"{num_used} photographs in use")
+    icon = TROUBLE if list_problems(settings) else READY
+    return StepState(icon=icon, text=f"{num_used} photographs")
+
+
+def cameras_state(settings: FEWVIEW_PG_settings) -> StepState:
+    """Step 2."""
+    solved = solved_or_none(settings)
+    if solved is not None:
+        icon = TROUBLE if solved.unplaced else READY
+        num_all = len(solved.cameras) + len(solved.unplaced)
+        return StepState(icon=icon, text=f"{len(solved.cameras)} of {num_all} photographs placed")
+    if settings.camera_source == "KNOWN":
+        if not settings.cameras_path:
+            return StepState(icon=TODO, text="No file chosen")
+        if not Path(bpy.path.abspath(settings.cameras_path)).exists():
+            return StepState(icon=TROUBLE, text="The file is missing")
+        return StepState(icon=READY, text="Known")
+    return StepState(icon=TODO, text="Estimated when you reconstruct")
+
+
+def region_state(settings: FEWVIEW_PG_settings) -> StepState:
+    """Step 3."""
+    if settings.region is None:
+        return StepState(icon=TODO, text="Found automatically")
+    return StepState(icon=READY, text="Set by the sphere in the scene")
+
+
+def result_state(settings: FEWVIEW_PG_settings) -> StepState:
+    """Step 5."""
+    if settings.result is None:
+        return StepState(icon=TODO, text="No mesh yet")
+    return StepState(icon=READY, text=settings.result.name)
+
+
+def solved_or_none(settings: FEWVIEW_PG_settings) -> SolvedScene | None:
+    """What step 2 found; None where it has not run, or its files are gone."""
+    if not settings.cameras_job:
+        return None
+    path = Path(bpy.path.abspath(settings.cameras_job)) / RESULT / CAMERAS
+    try:
+        key = (path, path.stat().st_mtime_ns)
+        if key not in _read:
+            _read.clear()  # one is shown at a time
+            _read[key] = read_solved(path)
+        return _read[key]
+    except (OSError, ValueError):
+        return None
+
+
+_read: dict[tuple[Path, int], SolvedScene] = {}
+"""The file that was read last: a panel is drawn many times a second."""

@@ -1,0 +1,257 @@
+"""Renders views of the scene that is there, with exact cameras, and leaves the scene as it was.
+
+FOLDER/images/000.png ...   8-bit RGBA, plain sRGB; alpha is the mask of the subject
+       truth.ply            the subject's true surface, world frame, where there is a subject
+       transforms.json      exact cameras as nerfstudio writes them; written last: without it the folder
+                            is not finished
+"""
+
+import json
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import bpy
+
+from .camera_lens import pinhole_of, world_from_camera
+from .kept_settings import Change, changed
+from .png import critical_chunks
+from .true_mesh import TrueMesh, subject_of, true_mesh, write_ply
+
+IMAGES, TRANSFORMS, TRUTH = "images", "transforms.json", "truth.ply"
+ENGINES = {"CYCLES": "CYCLES", "WORKBENCH": "BLENDER_WORKBENCH"}
+"""Blender's ids; any other name means the scene's own engine."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class View:
+    """One picture to take."""
+
+    camera: str
+    """Full name of the object; empty for the scene's camera at the frame."""
+    frame: int | None = None
+    """None for the frame that is shown."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ViewRequest:
+    """Everything that decides what is rendered."""
+
+    scene: str
+    """Full name."""
+    view_layer: str
+    views: tuple[View, ...]
+    target: str | None
+    """Full name of the subject's object; None to render the scene as it is."""
+    engine: str
+    samples: int
+    """Of Cycles."""
+    width: int
+    height: int
+
+
+def encode_request(request: ViewRequest) -> str:
+    """The request as JSON."""
+    return json.dumps(asdict(request))
+
+
+def decode_request(text: str) -> ViewRequest:
+    """The inverse of `encode_request`, for our own files. Raises ValueError, TypeError or KeyError."""
+    found = json.loads(text)
+    views = tuple(View(**view) for view in found.pop("views"))
+    return ViewRequest(views=views, **found)
+
+
+def render_views(request: ViewRequest, folder: Path) -> Iterator[tuple[int, Path]]:
+    """Render the context's scene into a new folder, and give number and file of each view when it is done.
+
+    The generator must be used up, or closed, before anything else touches the scene: only then is every
+    setting as it was. Raises ValueError where the scene cannot be rendered so, RuntimeError where Blender
+    fails to, OSError where the folder cannot be written.
+    """
+    scene = bpy.context.scene
+    if (scene.name_full, bpy.context.view_layer.name) != (request.scene, request.view_layer):
+        raise ValueError(f"{request.scene}, {request.view_layer} is not what Blender shows")
+    if not request.views:
+        raise ValueError("there are no cameras to render from")
+    subject = () if request.target is None else _subject(_object(scene, request.target))
+    cameras = [_object(scene, view.camera) for view in request.views if view.camera]
+    (folder / IMAGES).mkdir(parents=True)
+    frames: list[dict[str, Any]] = []
+    engine = ENGINES.get(request.engine, scene.render.engine)
+    changes = (
+        *render_changes(scene, request),
+        *camera_changes(scene, cameras),
+        *_mask_changes(scene, subject, engine),
+        *_surface_changes(subject),
+    )
+    with _same_frame(scene, request), changed(changes):
+        for index, view in enumerate(request.views):
+            _go_to(scene, view)
+            if index == 0 and subject:
+                truth = _truth(subject)
+            path = folder / IMAGES / f"{index:03d}.png"
+            frames.append(_take(scene, path, noise_seed=index))
+            yield index, path
+    if subject:
+        write_ply(folder / TRUTH, truth)
+    _write_transforms(folder / TRANSFORMS, frames)
+
+
+def render_changes(scene: bpy.types.Scene, request: ViewRequest) -> tuple[Change, ...]:
+    """The settings under which pictures are as a plain camera takes them."""
+    render, image, view = scene.render, scene.render.image_settings, scene.view_settings
+    cycles = getattr(scene, "cycles", None)
+    # A denoiser paints over the fine texture that stereo lives on.
+    of_cycles = {"samples": request.samples, "use_denoising": False, "time_limit": 0.0, "seed": 0}
+    of_render = {
+        "engine": ENGINES.get(request.engine, render.engine),
+        "resolution_x": request.width,
+        "resolution_y": request.height,
+        "resolution_percentage": 100,
+        "film_transparent": True,
+        "dither_intensity": 0.0,
+        "filepath": "",
+        "use_persistent_data": True,
+        "use_file_extension": True,
+        "use_overwrite": True,
+        "use_placeholder": False,
+    }
+    off = (
+        *("use_border", "use_crop_to_border", "use_compositing", "use_sequencer", "use_motion_blur"),
+        *("use_multiview", "use_stamp", "use_freestyle"),
+    )
+    # The first ones of these decide which of the later ones are possible.
+    of_image = {
+        "media_type": "IMAGE",
+        "file_format": "PNG",
+        "color_mode": "RGBA",
+        "color_depth": "8",
+        "color_management": "FOLLOW_SCENE",
+    }
+    return (
+        *((render, name, value) for name, value in of_render.items()),
+        *((render, name, False) for name in off),
+        *((image, name, value) for name, value in of_image.items()),
+        (scene.display_settings, "display_device", "sRGB"),
+        (view, "view_transform", "Standard"),
+        (view, "look", "None"),
+        (view, "gamma", 1.0),
+        (view, "use_curve_mapping", False),
+        *((cycles, name, value) for name, value in of_cycles.items() if cycles is not None),
+        (scene, "camera", scene.camera),
+    )
+
+
+def camera_changes(scene: bpy.types.Scene, cameras: Iterable[bpy.types.Object]) -> tuple[Change, ...]:
+    """No depth of field: a blurred edge is no measurement."""
+    markers = [marker.camera for marker in scene.timeline_markers]
+    everyone = {camera.data for camera in (*cameras, scene.camera, *markers) if camera and camera.data}
+    return tuple((data.dof, "use_dof", False) for data in everyone if isinstance(data, bpy.types.Camera))
+
+
+def _mask_changes(
+    scene: bpy.types.Scene, subject: tuple[bpy.types.Object, ...], engine: str
+) -> tuple[Change, ...]:
+    """What is not the subject lights it and is reflected in it, but is no part of the picture's alpha."""
+    if not subject:
+        return ()
+    instanced = {part for made in subject for part in _instanced(made)}
+    others = [made for made in scene.objects if made not in subject and made not in instanced]
+    if engine == ENGINES["WORKBENCH"]:  # it has neither light nor rays
+        return tuple((made, "hide_render", True) for made in others)
+    return tuple((made, "visible_camera", False) for made in others)
+
+
+def _instanced(made: bpy.types.Object) -> tuple[bpy.types.Object, ...]:
+    """Objects that appear as part of this one: hiding them from the camera would hide it."""
+    collection = made.instance_collection if made.instance_type == "COLLECTION" else None
+    if collection is None:
+        return ()
+    parts = tuple(collection.all_objects)
+    return (*parts, *(inner for part in parts for inner in _instanced(part)))
+
+
+def _surface_changes(subject: tuple[bpy.types.Object, ...]) -> tuple[Change, ...]:
+    """The true mesh is read as the viewport has it: let that be what is rendered."""
+    modifiers = [modifier for made in subject for modifier in made.modifiers]
+    shown = [(m, "show_viewport", m.show_render) for m in modifiers]
+    levels = [(m, "levels", m.render_levels) for m in modifiers if m.type in {"SUBSURF", "MULTIRES"}]
+    return (*shown, *levels)
+
+
+@contextmanager
+def _same_frame(scene: bpy.types.Scene, request: ViewRequest) -> Iterator[None]:
+    """Return to the frame that was shown, and its camera, where any view goes to another."""
+    frame, subframe, camera = scene.frame_current, scene.frame_subframe, scene.camera
+    try:
+        yield
+    finally:
+        if any(view.frame is not None for view in request.views):
+            scene.frame_set(frame, subframe=subframe)
+            scene.camera = camera
+
+
+def _go_to(scene: bpy.types.Scene, view: View) -> None:
+    """Show the view's frame through the view's camera."""
+    if view.frame is not None:
+        scene.frame_set(view.frame)  # a marker may change the scene's camera here
+    if view.camera:
+        scene.camera = _object(scene, view.camera)
+    if scene.camera is None:
+        raise ValueError("the scene has no camera: add one, or render from other cameras")
+    bpy.context.view_layer.update()
+
+
+def _take(scene: bpy.types.Scene, path: Path, *, noise_seed: int) -> dict[str, Any]:
+    """Render what the scene's camera sees to the file; its entry in transforms.json."""
+    if hasattr(scene, "cycles"):
+        scene.cycles.seed = noise_seed
+    camera = scene.camera
+    pinhole, pose = pinhole_of(scene, camera), world_from_camera(camera)
+    part = path.with_suffix(".part.png")
+    scene.render.filepath = str(part)
+    bpy.ops.render.render(write_still=True, layer=bpy.context.view_layer.name, scene=scene.name)
+    if not part.is_file():
+        raise RuntimeError(f"Blender rendered no picture from {camera.name}")
+    part.write_bytes(critical_chunks(part.read_bytes()))
+    part.replace(path)
+    return {
+        "file_path": f"{IMAGES}/{path.name}",
+        "w": pinhole.width,
+        "h": pinhole.height,
+        "fl_x": pinhole.fx_px,
+        "fl_y": pinhole.fy_px,
+        "cx": pinhole.cx_px,
+        "cy": pinhole.cy_px,
+        "transform_matrix": pose.tolist(),
+    }
+
+
+def _object(scene: bpy.types.Scene, full_name: str) -> bpy.types.Object:
+    found = next((made for made in scene.objects if made.name_full == full_name), None)
+    if found is None:
+        raise ValueError(f"there is no object {full_name} in the scene")
+    return found
+
+
+def _subject(target: bpy.types.Object) -> tuple[bpy.types.Object, ...]:
+    if target.hide_render:
+        raise ValueError(f"{target.name} is hidden from renders: show it, or choose another object")
+    return subject_of(target)
+
+
+def _truth(subject: tuple[bpy.types.Object, ...]) -> TrueMesh:
+    try:
+        return true_mesh(subject)
+    except ValueError as error:
+        raise ValueError(f"{subject[0].name} cannot be rendered: {error}") from error
+
+
+def _write_transforms(path: Path, frames: list[dict[str, Any]]) -> None:
+    part = path.with_suffix(".part")
+    content = {"camera_model": "PINHOLE", "frames": frames}
+    part.write_text(json.dumps(content, indent=2, allow_nan=False) + "\n", encoding="utf-8")
+    part.replace(path)

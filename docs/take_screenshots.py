@@ -1,0 +1,183 @@
+"""Takes the pictures of the add-on in docs/images: goes through all steps in a real Blender with a window.
+
+    blender --factory-startup --python docs/take_screenshots.py -- --output docs/images
+
+The extension must be installed and the environment variable FEWVIEW_PYTHON name a Python with the backend.
+The pictures are of the sidebar alone, and two of the viewport with the result. Takes about two minutes.
+"""
+
+import argparse
+import os
+import sys
+import tempfile
+import traceback
+from collections.abc import Iterator
+from pathlib import Path
+
+import bpy
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from addon.true_mesh import bounding_sphere, true_mesh
+from blender_scenes.lighting import light_scene
+from blender_scenes.reconstruct_scene import enable_extension
+from blender_scenes.scenes import SCENES, build_scene
+
+SIDEBAR_PX = 330
+SETTLE_S = 0.7
+"""Until what was changed is on the screen; drawing is slow where there is no GPU."""
+LIMIT_S = 420.0
+
+
+def tour(output: Path) -> Iterator[float]:
+    """Every state in turn; yields how many seconds to wait."""
+    python = os.environ.pop("FEWVIEW_PYTHON", "")
+    enable_extension()
+    settings = bpy.context.scene.fewview
+    yield from opened_sidebar()
+    yield from photographed(output / "panel_setup.png")
+
+    os.environ["FEWVIEW_PYTHON"] = python
+    bpy.ops.fewview.check_backend()
+    yield from until_idle()
+    yield from photographed(output / "panel_start.png")
+
+    target = subject()
+    settings.source = "RENDER"
+    settings.output = tempfile.mkdtemp(prefix="fewview-tour-")
+    bpy.ops.fewview.generate_views(target=target.name, arrangement="ARC", view_count=6)
+    yield from photographed(output / "panel_render.png")
+    yield from photographed(output / "views.png", whole=True)
+    bpy.ops.fewview.render_views(samples=16)
+    yield 6.0
+    yield from photographed(output / "panel_rendering.png")
+    yield from until_idle()
+
+    settings.source = "FILES"
+    yield from photographed(output / "panel_images.png")
+    bpy.ops.fewview.estimate_cameras()
+    yield from until_idle()
+    bpy.ops.fewview.add_region()
+    yield from photographed(output / "panel_cameras.png")
+    bpy.ops.fewview.remove_region()
+    target.hide_set(True)
+    bpy.ops.fewview.reconstruct()
+    yield 12.0
+    yield from photographed(output / "panel_running.png")
+    yield from until_idle()
+    yield from photographed(output / "panel_result.png")
+    yield from photographed(output / "result_colour.png", whole=True)
+    bpy.ops.fewview.show_support()
+    yield from photographed(output / "result_support.png", whole=True)
+
+    settings.images[0].path = str(output / "not_there.png")
+    bpy.ops.fewview.reconstruct()
+    yield from until_idle()
+    yield from photographed(output / "panel_failed.png")
+
+
+def subject() -> bpy.types.Object:
+    """The monkey of the demo, in its light."""
+    for made in list(bpy.context.scene.objects):
+        bpy.data.objects.remove(made)
+    built = build_scene(SCENES["monkey"]("monkey", 0))
+    centre, radius = bounding_sphere(true_mesh(built.subjects))
+    light_scene(centre=centre, radius=radius)
+    bpy.context.view_layer.objects.active = built.subjects[0]
+    return built.subjects[0]
+
+
+def opened_sidebar() -> Iterator[float]:
+    """The sidebar with FewView's tab in front, wide enough to read."""
+    area = view()
+    area.spaces.active.show_region_ui = True
+    area.spaces.active.shading.type = "SOLID"
+    yield 1.0
+    region = next(region for region in area.regions if region.type == "UI")
+    region.active_panel_category = "FewView"
+    yield SETTLE_S
+
+
+def photographed(path: Path, *, whole: bool = False) -> Iterator[float]:
+    """Write the sidebar, or the whole viewport, as a PNG."""
+    area = view()
+    region = next(region for region in area.regions if region.type == "UI")
+    if region.active_panel_category != "FewView":
+        region.active_panel_category = "FewView"
+    area.tag_redraw()
+    yield SETTLE_S
+    with bpy.context.temp_override(window=bpy.context.window_manager.windows[0], area=area):
+        if whole:
+            bpy.ops.view3d.view_all()
+            yield SETTLE_S
+    with bpy.context.temp_override(window=bpy.context.window_manager.windows[0], area=area):
+        bpy.ops.screen.screenshot_area(filepath=str(path))
+    if not whole:
+        keep_columns(path, region.x - area.x, region.width)
+    sys.stderr.write(f"{path}\n")
+
+
+def keep_columns(path: Path, first: int, count: int) -> None:
+    """Cut the picture to some of its columns."""
+    image = bpy.data.images.load(str(path))
+    width, height = image.size
+    pixels = np.empty(width * height * 4, np.float32)
+    image.pixels.foreach_get(pixels)
+    cut = pixels.reshape(height, width, 4)[:, first : first + count]
+    bpy.data.images.remove(image)
+    made = bpy.data.images.new("cut", cut.shape[1], height)
+    made.pixels.foreach_set(np.ascontiguousarray(cut).ravel())
+    made.filepath_raw, made.file_format = str(path), "PNG"
+    made.save()
+    bpy.data.images.remove(made)
+
+
+def until_idle() -> Iterator[float]:
+    """Wait for the running job."""
+    import importlib
+
+    package = type(bpy.context.preferences.addons.get(extension_name()).preferences).bl_idname
+    jobs = importlib.import_module(f"{package}.addon.jobs")
+    while jobs.running() is not None:
+        yield 0.2
+    end = jobs.ended()
+    sys.stderr.write(f"{end.title}: {'fine' if end.failure is None else end.failure.text}\n")
+    yield SETTLE_S
+
+
+def extension_name() -> str:
+    """The module Blender knows the add-on by."""
+    return next(name for name in bpy.context.preferences.addons.keys() if name.endswith(".fewview"))  # noqa: SIM118
+
+
+def view() -> bpy.types.Area:
+    """The 3D viewport."""
+    screen = bpy.context.window_manager.windows[0].screen
+    return next(area for area in screen.areas if area.type == "VIEW_3D")
+
+
+def main(words: list[str]) -> None:
+    """Start the tour once the window is there; Blender quits at its end, with code 1 where it failed."""
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--output", type=Path, required=True)
+    output = parser.parse_args(words).output.absolute()
+    output.mkdir(parents=True, exist_ok=True)
+    steps = tour(output)
+
+    def step() -> float | None:
+        try:
+            return next(steps)
+        except StopIteration:
+            bpy.ops.wm.quit_blender()
+        except Exception:  # noqa: BLE001 - a timer would drop it in silence
+            traceback.print_exc()
+            sys.stderr.flush()
+            os._exit(1)
+        return None
+
+    bpy.app.timers.register(step, first_interval=2.0, persistent=True)
+
+
+if __name__ == "__main__":
+    main(sys.argv[sys.argv.index("--") + 1 :])

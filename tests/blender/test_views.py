@@ -1,0 +1,618 @@
+"""Rendered views: cameras around an object, exact intrinsics, a mask of the subject, and nothing changed."""
+
+import importlib
+import json
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import pytest
+
+bpy = pytest.importorskip("bpy", reason="needs Blender's Python, where `import bpy` works")
+
+from bpy_extras.object_utils import world_to_camera_view  # noqa: E402
+from mathutils import Matrix, Vector  # noqa: E402
+
+pytestmark = pytest.mark.blender
+SMALL = {"resolution_x": 64, "resolution_y": 48, "samples": 1}
+
+
+@pytest.fixture
+def rendering(addon: ModuleType) -> ModuleType:
+    return importlib.import_module(addon.__name__ + ".view_rendering")
+
+
+@pytest.fixture
+def cube(addon: ModuleType) -> Any:
+    """A cube of 1 m beside the origin, on a floor, under a lamp."""
+    bpy.ops.mesh.primitive_plane_add(size=20.0, location=(0, 0, -0.5))
+    bpy.context.object.name = "Floor"
+    bpy.ops.object.light_add(type="SUN")
+    bpy.ops.mesh.primitive_cube_add(size=1.0, location=(3, 1, 0))
+    return bpy.context.object
+
+
+def generate(**arguments: Any) -> list[Any]:
+    assert bpy.ops.fewview.generate_views(**{"view_count": 3, **SMALL_SIZE, **arguments}) == {"FINISHED"}
+    found = [made for made in bpy.data.objects if "fewview_view" in made]
+    return sorted(found, key=lambda camera: camera["fewview_view"])
+
+
+SMALL_SIZE = {key: value for key, value in SMALL.items() if key != "samples"}
+
+
+def corners(made: Any) -> list[Any]:
+    return [made.matrix_world @ Vector(corner) for corner in made.bound_box]
+
+
+def pixels_rgba(path: Path) -> Any:
+    """(height, width, 4), top row first, values as stored."""
+    image = bpy.data.images.load(str(path))
+    image.colorspace_settings.name = "Non-Color"
+    width, height = image.size
+    values = np.array(image.pixels, np.float32).reshape(height, width, 4)[::-1]
+    bpy.data.images.remove(image)
+    return values
+
+
+def transforms(folder: Path) -> list[dict[str, Any]]:
+    return json.loads((folder / "transforms.json").read_text(encoding="utf-8"))["frames"]
+
+
+def projected(frame: dict[str, Any], point: Any) -> tuple[float, float]:
+    """Column and row of a point, by the definition of a pinhole."""
+    x, y, z = (np.linalg.inv(frame["transform_matrix"]) @ [*point, 1.0])[:3]
+    return frame["cx"] + frame["fl_x"] * x / -z, frame["cy"] - frame["fl_y"] * y / -z
+
+
+# Cameras
+
+
+@pytest.mark.parametrize("kind", ["ARC", "RING", "HEMISPHERE"])
+@pytest.mark.parametrize("size", [(64, 48), (48, 64)])
+@pytest.mark.parametrize("aspect", [(1.0, 1.0), (2.0, 1.0), (1.0, 1.5)])
+def test_generated_cameras_hold_the_object(cube: Any, kind: str, size: Any, aspect: Any) -> None:
+    scene = bpy.context.scene
+    render = scene.render
+    render.pixel_aspect_x, render.pixel_aspect_y = aspect
+    render.resolution_x, render.resolution_y = size
+    cameras = generate(arrangement=kind, resolution_x=size[0], resolution_y=size[1])
+    bpy.context.view_layer.update()
+    seen = np.array([[world_to_camera_view(scene, c, p)[:2] for p in corners(cube)] for c in cameras])
+    assert seen.min() > 0.03
+    assert seen.max() < 0.97
+    assert seen.max() > 0.85 or seen.min() < 0.15
+
+
+def test_children_and_instances_are_held_too(cube: Any) -> None:
+    bpy.ops.mesh.primitive_cube_add(size=0.2, location=(3, 1, 4))
+    child = bpy.context.object
+    child.parent = cube
+    child.matrix_parent_inverse = cube.matrix_world.inverted()
+    group = bpy.data.collections.new("group")
+    bpy.ops.mesh.primitive_cube_add(size=0.2)
+    group.objects.link(bpy.context.object)
+    copy = bpy.data.objects.new("copy", None)
+    copy.instance_type, copy.instance_collection, copy.location = "COLLECTION", group, (3, -5, 0)
+    copy.parent = cube
+    copy.matrix_parent_inverse = cube.matrix_world.inverted()
+    bpy.context.scene.collection.objects.link(copy)
+    cameras = generate(target=cube.name)
+    bpy.context.scene.render.resolution_x, bpy.context.scene.render.resolution_y = 64, 48
+    bpy.context.view_layer.update()
+    for camera in cameras:
+        for point in ((3, 1, 4.1), (3, -5.1, 0)):
+            seen = world_to_camera_view(bpy.context.scene, camera, Vector(point))
+            assert 0 < seen.x < 1
+            assert 0 < seen.y < 1
+
+
+def test_generating_again_replaces_what_was_generated_and_nothing_else(cube: Any) -> None:
+    own = bpy.data.objects.new("own", bpy.data.cameras.new("own"))
+    bpy.context.scene.collection.objects.link(own)
+    first = generate()
+    own.parent = first[0]
+    names = {made.name for made in bpy.data.objects}
+    bpy.context.view_layer.update()
+    place = own.matrix_world.copy()
+    generate()
+    bpy.context.view_layer.update()
+    np.testing.assert_allclose(own.matrix_world, place, atol=1e-5)
+    assert {made.name for made in bpy.data.objects} == names
+    assert own.parent is None
+    assert len(generate(view_count=5)) == 5
+    assert bpy.ops.fewview.remove_views() == {"FINISHED"}
+    assert not [made for made in bpy.data.objects if "fewview_view" in made]
+    assert not [made for made in bpy.data.collections if "fewview_view" in made]
+    assert own.name in bpy.context.scene.objects
+    with pytest.raises(RuntimeError, match="no generated cameras"):
+        bpy.ops.fewview.remove_views()
+
+
+def test_arguments_left_out_are_the_scenes_and_are_not_remembered(cube: Any) -> None:
+    settings = bpy.context.scene.fewview
+    settings.view_count, settings.lens_mm = 4, 85.0
+    assert bpy.ops.fewview.generate_views(lens_mm=35.0) == {"FINISHED"}
+    cameras = [made for made in bpy.data.objects if "fewview_view" in made]
+    assert [camera.data.lens for camera in cameras] == [35.0] * 4
+    assert bpy.ops.fewview.generate_views() == {"FINISHED"}
+    cameras = [made for made in bpy.data.objects if "fewview_view" in made]
+    assert [camera.data.lens for camera in cameras] == [85.0] * 4
+    assert settings.target == cube
+    for operator in (bpy.ops.fewview.generate_views, bpy.ops.fewview.render_views):
+        arguments = [prop for prop in operator.get_rna_type().properties if prop.identifier != "rna_type"]
+        assert all(prop.is_skip_save for prop in arguments)
+
+
+def test_generating_around_nothing_says_why(addon: ModuleType) -> None:
+    with pytest.raises(RuntimeError, match="Add an object"):
+        bpy.ops.fewview.generate_views()
+    bpy.ops.object.empty_add()
+    with pytest.raises(RuntimeError, match="no visible surface"):
+        bpy.ops.fewview.generate_views()
+    with pytest.raises(RuntimeError, match="no object Moon"):
+        bpy.ops.fewview.generate_views(target="Moon")
+
+
+# Pictures
+
+
+def test_rendered_views_are_exact_masked_and_taken_over(cube: Any, tmp_path: Path) -> None:
+    """The subject's outline in the alpha is where its corners are by the file's cameras."""
+    generate()
+    assert bpy.ops.fewview.render_views(output=str(tmp_path), **SMALL) == {"FINISHED"}
+    folder = tmp_path / "views-001"
+    assert sorted(path.name for path in folder.iterdir()) == ["images", "transforms.json", "truth.ply"]
+    frames = transforms(folder)
+    assert [frame["file_path"] for frame in frames] == [f"images/00{i}.png" for i in range(3)]
+    for frame in frames:
+        alpha = pixels_rgba(folder / frame["file_path"])[..., 3]
+        rows, columns = np.nonzero(alpha > 0.5)
+        seen = np.array([projected(frame, corner) for corner in corners(cube)])
+        edges = [columns.min(), rows.min(), columns.max() + 1, rows.max() + 1]
+        np.testing.assert_allclose(edges, [*seen.min(axis=0), *seen.max(axis=0)], atol=1.5)
+        assert alpha[0].max() == 0.0
+    settings = bpy.context.scene.fewview
+    assert [(image.width, image.height, image.use) for image in settings.images] == [(64, 48, True)] * 3
+    assert settings.images[0].path == str(folder / "images/000.png")
+    assert (settings.source, settings.camera_source) == ("RENDER", "KNOWN")
+    assert settings.cameras_path == str(folder / "transforms.json")
+    assert settings.truth == str(folder / "truth.ply")
+
+
+def test_a_second_rendering_gets_a_folder_of_its_own(cube: Any, tmp_path: Path) -> None:
+    generate(view_count=2)
+    for _ in range(2):
+        bpy.ops.fewview.render_views(output=str(tmp_path), **SMALL)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["views-001", "views-002"]
+    first, second = ((tmp_path / f"views-00{i}/images/000.png").read_bytes() for i in (1, 2))
+    assert first == second
+    assert not any(chunk in first for chunk in (b"tEXt", b"zTXt", b"iTXt", b"eXIf"))  # nothing of the user's
+
+
+def test_without_a_target_everything_is_in_the_mask(cube: Any, tmp_path: Path) -> None:
+    generate(view_count=2)
+    bpy.ops.fewview.render_views(target="", output=str(tmp_path), **SMALL)
+    assert not (tmp_path / "views-001/truth.ply").exists()
+    assert pixels_rgba(tmp_path / "views-001/images/000.png")[-1, :, 3].min() > 0.99
+
+
+def test_the_floor_still_lights_the_subject(cube: Any, tmp_path: Path) -> None:
+    """A glowing floor that is not in the mask is seen in the colour of the cube."""
+    bpy.data.objects["Sun"].hide_render = True
+    glow = bpy.data.materials.new("glow")
+    glow.use_nodes = True
+    shader = next(node for node in glow.node_tree.nodes if node.type == "BSDF_PRINCIPLED")
+    shader.inputs["Emission Color"].default_value = (1.0, 0.0, 0.0, 1.0)
+    shader.inputs["Emission Strength"].default_value = 5.0
+    bpy.data.objects["Floor"].data.materials.append(glow)
+    generate(view_count=2)
+    bpy.ops.fewview.render_views(output=str(tmp_path), **{**SMALL, "samples": 16})
+    picture = pixels_rgba(tmp_path / "views-001/images/000.png")
+    inside = picture[picture[..., 3] > 0.99]
+    assert inside[:, 0].mean() > 0.2
+    assert inside[:, 0].mean() > 3 * inside[:, 2].mean()
+
+
+@pytest.mark.parametrize("percentage", [100, 50])
+@pytest.mark.parametrize("fit", ["AUTO", "HORIZONTAL", "VERTICAL"])
+def test_selected_cameras_have_their_own_lenses(cube: Any, tmp_path: Path, fit: str, percentage: int) -> None:
+    """Off-centre, with high pixels, not the same in each: as `world_to_camera_view` has it to 0.01 px."""
+    scene = bpy.context.scene
+    scene.render.pixel_aspect_y = 1.25
+    scene.render.resolution_percentage = percentage
+    for lens, shift in ((35.0, (0.1, -0.05)), (50.0, (-0.2, 0.15))):
+        camera = bpy.data.objects.new("mine", bpy.data.cameras.new("mine"))
+        scene.collection.objects.link(camera)
+        camera.data.lens, camera.data.sensor_fit = lens, fit
+        camera.data.shift_x, camera.data.shift_y = shift
+        camera.matrix_world = Matrix.Translation((3, -4, 1)) @ Matrix.Rotation(1.4, 4, "X")
+        camera.scale = (2, 2, 2)
+        camera.select_set(True)
+    arguments = {"view_cameras": "SELECTED", "output": str(tmp_path), "target": cube.name, **SMALL}
+    bpy.ops.fewview.render_views(**arguments)
+    frames = transforms(tmp_path / "views-001")
+    cameras = [made for made in bpy.context.view_layer.objects if made.type == "CAMERA"]
+    assert len(frames) == 2
+    assert scene.render.resolution_percentage == percentage
+    scene.render.resolution_percentage = 100
+    scene.render.resolution_x, scene.render.resolution_y = 64, 48
+    for camera, frame in zip(cameras, frames, strict=True):
+        assert frame["fl_x"] != pytest.approx(frame["fl_y"])
+        for point in corners(cube):
+            share = world_to_camera_view(scene, camera, point)
+            expected = (share.x * 64, (1 - share.y) * 48)
+            assert projected(frame, point) == pytest.approx(expected, abs=0.01)
+
+
+def test_an_animated_camera_is_followed_through_markers(cube: Any, tmp_path: Path) -> None:
+    scene = bpy.context.scene
+    scene.frame_start, scene.frame_end = 1, 21
+    cameras = []
+    for index in range(2):
+        camera = bpy.data.objects.new(f"mine {index}", bpy.data.cameras.new("mine"))
+        scene.collection.objects.link(camera)
+        camera.rotation_euler = (np.pi / 2, 0, 0)
+        for frame, x in ((1, 2.0 + index), (21, 4.0 + index)):
+            camera.location = (x, -6, 0)
+            camera.data.lens = 20 + frame
+            camera.keyframe_insert("location", frame=frame)
+            camera.data.keyframe_insert("lens", frame=frame)
+        cameras.append(camera)
+    scene.camera = cameras[0]
+    scene.timeline_markers.new("cut", frame=11).camera = cameras[1]
+    scene.timeline_markers.new("start", frame=1).camera = cameras[0]
+    scene.frame_set(5)
+    arguments = {"view_cameras": "ANIMATED", "frame_step": 10, "output": str(tmp_path), **SMALL}
+    bpy.ops.fewview.render_views(**arguments)
+    frames = transforms(tmp_path / "views-001")
+    assert [frame["transform_matrix"][0][3] for frame in frames] == pytest.approx([2.0, 4.0, 5.0])
+    assert frames[0]["fl_x"] / 64 * 36 == pytest.approx(21, rel=1e-4)
+    assert frames[2]["fl_x"] / 64 * 36 == pytest.approx(41, rel=1e-4)
+    assert (scene.frame_current, scene.camera) == (5, cameras[0])
+
+
+def test_workbench_masks_too(cube: Any, tmp_path: Path, rendering: ModuleType) -> None:
+    """Not rendered, as it needs a GPU or its software: the floor is hidden from it as from a camera."""
+    changes = rendering._mask_changes(bpy.context.scene, (cube,), "BLENDER_WORKBENCH")
+    assert {(made.name, name, value) for made, name, value in changes} == {
+        ("Floor", "hide_render", True),
+        ("Sun", "hide_render", True),
+    }
+
+
+# What is left behind
+
+
+def dump(owner: Any, depth: int = 3) -> dict[str, Any]:
+    """All values that can be read, by path."""
+    found: dict[str, Any] = {}
+    for prop in owner.bl_rna.properties:
+        if prop.identifier in {"rna_type", "bl_rna"}:
+            continue
+        value = getattr(owner, prop.identifier)
+        if prop.type == "POINTER":
+            if value is not None and not isinstance(value, bpy.types.ID) and depth:
+                found |= {f"{prop.identifier}.{k}": v for k, v in dump(value, depth - 1).items()}
+            elif isinstance(value, bpy.types.ID):
+                found[prop.identifier] = value.name_full
+        elif prop.type != "COLLECTION":
+            is_array = getattr(prop, "is_array", False)
+            found[prop.identifier] = tuple(np.ravel(value)) if is_array else value
+    return found
+
+
+def state() -> dict[str, Any]:
+    bpy.context.view_layer.update()  # else what is derived may be from before the last change
+    scene = bpy.context.scene
+    parts = {
+        "render": scene.render,
+        "cycles": scene.cycles,
+        "view": scene.view_settings,
+        "display": scene.display_settings,
+        "world": scene.world,
+    }
+    found = {f"{name}.{k}": v for name, part in parts.items() if part for k, v in dump(part).items()}
+    found |= {"frame": scene.frame_current_final, "camera": scene.camera and scene.camera.name}
+    for made in scene.objects:
+        found |= {f"{made.name}.{k}": v for k, v in dump(made, 0).items()}
+        found |= {f"{made.name}.{m.name}.{k}": v for m in made.modifiers for k, v in dump(m, 0).items()}
+        if made.type == "CAMERA":
+            found |= {f"{made.name}.data.{k}": v for k, v in dump(made.data).items()}
+    return found
+
+
+@pytest.fixture
+def unusual(cube: Any) -> dict[str, Any]:
+    """A scene in which nearly everything that rendering changes is set to something else."""
+    scene, render = bpy.context.scene, bpy.context.scene.render
+    generate(view_count=2)
+    bpy.context.view_layer.objects.active = cube
+    subdivision = cube.modifiers.new("Subdivision", "SUBSURF")
+    subdivision.levels, subdivision.render_levels, subdivision.show_viewport = 0, 2, False
+    for frame, turn in ((10, 0.0), (24, 3.0)):
+        cube.rotation_euler.z = turn
+        cube.keyframe_insert("rotation_euler", frame=frame)
+    render.engine = "BLENDER_WORKBENCH"
+    if hasattr(render.image_settings, "media_type"):
+        render.image_settings.media_type = "MULTI_LAYER_IMAGE"
+    render.image_settings.file_format = "OPEN_EXR_MULTILAYER"
+    render.image_settings.color_depth = "32"
+    render.resolution_percentage, render.use_border, render.use_crop_to_border = 37, True, True
+    render.border_min_x, render.border_max_y = 0.25, 0.5
+    render.use_stamp, render.use_motion_blur, render.use_multiview = True, True, True
+    render.film_transparent, render.dither_intensity, render.filepath = False, 1.7, "//mine"
+    scene.view_settings.view_transform = "Filmic"
+    scene.view_settings.look = "Filmic - High Contrast" if bpy.app.version < (4, 0) else "High Contrast"
+    scene.view_settings.gamma, scene.view_settings.exposure = 1.3, 0.5
+    scene.view_settings.use_curve_mapping = True
+    scene.cycles.samples, scene.cycles.seed, scene.cycles.use_denoising = 77, 5, True
+    blur = scene.camera.data.dof
+    blur.use_dof, blur.aperture_fstop, blur.focus_distance = True, 0.05, 0.5
+    scene.frame_set(17, subframe=0.25)
+    bpy.data.objects["Floor"].visible_camera = False
+    return state()
+
+
+def test_every_setting_is_as_it_was(unusual: dict[str, Any], tmp_path: Path) -> None:
+    bpy.ops.fewview.render_views(output=str(tmp_path), **SMALL)
+    assert state() == unusual
+    bpy.ops.fewview.render_views(
+        output=str(tmp_path), view_cameras="ANIMATED", frame_step=150, **{**SMALL, "engine": "CYCLES"}
+    )
+    assert state() == unusual
+
+
+def test_pictures_do_not_depend_on_what_is_set(unusual: dict[str, Any], tmp_path: Path) -> None:
+    """But for what the user sees as the look of the scene: its exposure."""
+    bpy.ops.fewview.render_views(output=str(tmp_path), **SMALL)
+    scene, render = bpy.context.scene, bpy.context.scene.render
+    render.use_border = render.use_crop_to_border = render.use_stamp = False
+    render.use_motion_blur = render.use_multiview = False
+    render.dither_intensity, render.resolution_percentage = 0.0, 100
+    scene.view_settings.view_transform = "Standard"
+    scene.view_settings.look, scene.view_settings.gamma = "None", 1.0
+    scene.view_settings.use_curve_mapping = scene.camera.data.dof.use_dof = False
+    bpy.data.objects["Floor"].visible_camera = True
+    bpy.ops.fewview.render_views(output=str(tmp_path), **SMALL)
+    first, second = ((tmp_path / f"views-00{i}/images/000.png").read_bytes() for i in (1, 2))
+    assert first == second
+    assert pixels_rgba(tmp_path / "views-001/images/000.png").shape == (48, 64, 4)
+
+
+def request(rendering: ModuleType, **changes: Any) -> Any:
+    names = [made.name_full for made in bpy.context.scene.objects if made.type == "CAMERA"]
+    given = {
+        "scene": bpy.context.scene.name_full,
+        "view_layer": bpy.context.view_layer.name,
+        "views": tuple(rendering.View(camera=name) for name in names),
+        "target": "Cube",
+        "engine": "CYCLES",
+        "samples": 1,
+        "width": 64,
+        "height": 48,
+        **changes,
+    }
+    return rendering.ViewRequest(**given)
+
+
+@pytest.fixture
+def break_second_view(rendering: ModuleType, monkeypatch: pytest.MonkeyPatch) -> Callable[[], None]:
+    take = rendering._take
+
+    def broken(*arguments: Any, noise_seed: int) -> Any:
+        if noise_seed == 1:
+            raise RuntimeError("out of order")
+        return take(*arguments, noise_seed=noise_seed)
+
+    return lambda: monkeypatch.setattr(rendering, "_take", broken)
+
+
+def test_after_an_error_every_setting_is_as_it_was(
+    unusual: dict[str, Any], rendering: ModuleType, break_second_view: Callable[[], None], tmp_path: Path
+) -> None:
+    break_second_view()
+    views = rendering.render_views(request(rendering), tmp_path / "new")
+    assert next(views)[0] == 0
+    assert state() != unusual
+    with pytest.raises(RuntimeError, match="out of order"):
+        next(views)
+    assert state() == unusual
+    assert not (tmp_path / "new/transforms.json").exists()
+
+
+def test_a_rendering_that_is_left_restores_everything(
+    unusual: dict[str, Any], rendering: ModuleType, tmp_path: Path
+) -> None:
+    views: Iterator[Any] = rendering.render_views(request(rendering), tmp_path / "new")
+    next(views)
+    views.close()
+    assert state() == unusual
+    assert sorted(path.name for path in (tmp_path / "new").rglob("*")) == ["000.png", "images"]
+
+
+def test_an_operators_error_restores_everything_and_reaches_the_script(
+    unusual: dict[str, Any], break_second_view: Callable[[], None], tmp_path: Path
+) -> None:
+    break_second_view()
+    with pytest.raises(RuntimeError, match="out of order"):
+        bpy.ops.fewview.render_views(output=str(tmp_path), **SMALL)
+    assert state() == unusual
+    assert not bpy.context.scene.fewview.images
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"views": ()}, "no cameras"),
+        ({"view_layer": "Moon"}, "Moon is not what Blender shows"),
+        ({"target": "Moon"}, "no object Moon"),
+        ({"target": "Floor"}, "Floor is hidden"),
+        ({"target": "Sun"}, "Sun cannot be rendered: there is no visible surface"),
+    ],
+)
+def test_what_cannot_be_rendered_says_why(
+    cube: Any, rendering: ModuleType, tmp_path: Path, changes: dict[str, Any], message: str
+) -> None:
+    generate(view_count=2)
+    bpy.data.objects["Floor"].hide_render = True
+    with pytest.raises(ValueError, match=message):
+        list(rendering.render_views(request(rendering, **changes), tmp_path / "new"))
+
+
+def test_cameras_that_have_just_been_moved_are_where_they_are(
+    cube: Any, rendering: ModuleType, tmp_path: Path
+) -> None:
+    camera = generate(view_count=2)[0]
+    camera.location = (1, 2, 3)
+    list(rendering.render_views(request(rendering, target=None), tmp_path / "new"))
+    assert np.array(transforms(tmp_path / "new")[0]["transform_matrix"])[:3, 3] == pytest.approx((1, 2, 3))
+
+
+def test_the_users_folder_is_not_written_into(cube: Any, rendering: ModuleType, tmp_path: Path) -> None:
+    generate(view_count=2)
+    (tmp_path / "images").mkdir()
+    with pytest.raises(FileExistsError):
+        list(rendering.render_views(request(rendering), tmp_path))
+
+
+@pytest.mark.parametrize(
+    ("kind", "message"),
+    [
+        ("GENERATED", "no generated cameras"),
+        ("SELECTED", "No camera is selected"),
+        ("ANIMATED", "The scene has no camera"),
+    ],
+)
+def test_no_cameras_say_what_to_do(cube: Any, tmp_path: Path, kind: str, message: str) -> None:
+    with pytest.raises(RuntimeError, match="Generate cameras first, or add one"):
+        bpy.ops.fewview.render_views()
+    camera = bpy.data.objects.new("mine", bpy.data.cameras.new("mine"))
+    bpy.context.scene.collection.objects.link(camera)
+    with pytest.raises(RuntimeError, match=message):
+        bpy.ops.fewview.render_views(view_cameras=kind, output=str(tmp_path))
+    assert not list(tmp_path.iterdir())
+
+
+def test_orthographic_and_mirrored_cameras_are_refused(cube: Any, tmp_path: Path) -> None:
+    (camera,) = generate(view_count=2)[:1]
+    camera.data.type = "ORTHO"
+    with pytest.raises(RuntimeError, match="no perspective camera"):
+        bpy.ops.fewview.render_views(output=str(tmp_path), **SMALL)
+    camera.data.type, camera.scale = "PERSP", (-1, 1, 1)
+    with pytest.raises(RuntimeError, match="mirrored"):
+        bpy.ops.fewview.render_views(output=str(tmp_path), **SMALL)
+
+
+def test_the_truth_is_what_is_rendered(unusual: dict[str, Any], tmp_path: Path) -> None:
+    """With the subdivision of renders, though the viewport shows none."""
+    bpy.ops.fewview.render_views(output=str(tmp_path), **SMALL)
+    header = (tmp_path / "views-001/truth.ply").read_bytes()[:200]
+    assert b"element vertex 98\n" in header
+
+
+def test_the_request_survives_its_file(rendering: ModuleType, cube: Any) -> None:
+    generate()
+    wanted = request(rendering)
+    assert rendering.decode_request(rendering.encode_request(wanted)) == wanted
+
+
+# The second Blender
+
+
+@pytest.fixture
+def second_blender(addon: ModuleType, monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    """The module; where Blender is a Python module, with a Python as the Blender that it starts."""
+    worker = importlib.import_module(addon.__name__ + ".render_worker")
+
+    def command(folder: Path) -> tuple[str, ...]:
+        script = (
+            f"import bpy, importlib; bpy.ops.wm.open_mainfile(filepath={str(folder / worker.COPY)!r});"
+            f"importlib.import_module({worker.__name__!r}).main({str(folder)!r})"
+        )
+        return (sys.executable, "-c", script)
+
+    if not bpy.app.binary_path:
+        monkeypatch.setattr(worker, "worker_command", command)
+    monkeypatch.setattr(worker, "needs_waiting", lambda: False)
+    return worker
+
+
+@pytest.fixture
+def painted(cube: Any, tmp_path: Path) -> Any:
+    """The cube glows in the colour of a picture that a saved .blend names by a relative path."""
+    (tmp_path / "own/textures").mkdir(parents=True)
+    image = bpy.data.images.new("green", 8, 8)
+    image.pixels = [0.0, 1.0, 0.0, 1.0] * 64
+    image.filepath_raw, image.file_format = str(tmp_path / "own/textures/green.png"), "PNG"
+    image.save()
+    bpy.data.images.remove(image)
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "own/work.blend"))
+    cube = bpy.data.objects["Cube"]
+    glow = bpy.data.materials.new("glow")
+    glow.use_nodes = True
+    tree = glow.node_tree
+    texture, emission = tree.nodes.new("ShaderNodeTexImage"), tree.nodes.new("ShaderNodeEmission")
+    texture.image = bpy.data.images.load("//textures/green.png")
+    tree.links.new(texture.outputs[0], emission.inputs[0])
+    output = next(node for node in tree.nodes if node.type == "OUTPUT_MATERIAL")
+    tree.links.new(emission.outputs[0], output.inputs[0])
+    cube.data.materials.append(glow)
+    return cube
+
+
+def test_a_second_blender_renders_what_is_not_saved(
+    painted: Any, second_blender: ModuleType, tmp_path: Path
+) -> None:
+    painted.location.x = 7.0  # since the file was saved
+    generate(view_count=2)
+    before = {path: path.read_bytes() for path in (tmp_path / "own").rglob("*") if path.is_file()}
+    image = bpy.data.images[0]
+    assert image.filepath == "//textures/green.png"
+    assert bpy.ops.fewview.render_views(output=str(tmp_path / "jobs"), **SMALL) == {"FINISHED"}
+    folder = tmp_path / "jobs/views-001"
+    assert sorted(path.name for path in folder.iterdir()) == [
+        *("images", "render.log", "transforms.json", "truth.ply"),
+    ]
+    picture = pixels_rgba(folder / "images/001.png")
+    inside = picture[picture[..., 3] > 0.99]
+    assert len(inside) > 100
+    np.testing.assert_allclose(inside, np.tile([0, 1, 0, 1], (len(inside), 1)), atol=0.01)
+    assert projected(transforms(folder)[0], (7, 1, 0)) == pytest.approx((32, 24), abs=0.1)
+    assert [image.width for image in bpy.context.scene.fewview.images] == [64, 64]
+    assert image.filepath == "//textures/green.png"
+    assert bpy.data.filepath == str(tmp_path / "own/work.blend")
+    assert {path: path.read_bytes() for path in before} == before
+
+
+def test_an_error_in_the_second_blender_reaches_the_first(
+    cube: Any, second_blender: ModuleType, tmp_path: Path
+) -> None:
+    generate(view_count=2)[1].data.type = "ORTHO"
+    with pytest.raises(RuntimeError, match=r"could not be rendered: .* no perspective camera"):
+        bpy.ops.fewview.render_views(output=str(tmp_path), **SMALL)
+    assert not (tmp_path / "views-001/transforms.json").exists()
+    assert not (tmp_path / "views-001" / second_blender.COPY).exists()
+
+
+@pytest.mark.parametrize("samples", [1, 100_000])
+def test_the_second_blender_is_cancelled_between_views_or_within_one(
+    cube: Any, second_blender: ModuleType, addon: ModuleType, tmp_path: Path, samples: int
+) -> None:
+    generate(view_count=900 if samples == 1 else 2)
+    jobs = importlib.import_module(addon.__name__ + ".jobs")
+    threading.Timer(5.0, jobs.cancel).start()
+    started = time.monotonic()
+    with pytest.raises(RuntimeError, match="The rendering was stopped"):
+        bpy.ops.fewview.render_views(
+            output=str(tmp_path), resolution_x=400, resolution_y=300, samples=samples
+        )
+    assert 4.5 < time.monotonic() - started < (6.3 if samples == 1 else 9.0)
+    assert jobs.ended().cancelled
+    assert not (tmp_path / "views-001/transforms.json").exists()
+    assert not bpy.context.scene.fewview.images

@@ -1,0 +1,61 @@
+"""Small wheels that doctor takes for the packages that the backend needs; standard library only."""
+
+import zipfile
+from collections.abc import Mapping
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+FAKE_TORCH = """
+class cuda:
+    is_available = staticmethod(lambda: False)
+class backends:
+    class mps:
+        is_available = staticmethod(lambda: False)
+class autograd:
+    grad = staticmethod(lambda *_: (Number(),))
+device = Generator = Tensor = type("Stand-in", (), {})
+class Number:
+    def __getattr__(self, _): return self
+    def __call__(self, *_): return self
+    def __matmul__(self, _): return self
+    def __rmul__(self, _): return self
+    def __sub__(self, _): return self
+    def __float__(self): return 0.0
+tensor = lambda *_, **__: Number()
+"""
+
+
+def write_wheel(folder: Path, distribution: str, version: str, *, module: str, code: str = "") -> None:
+    """The smallest wheel that pip installs."""
+    name = distribution.replace("-", "_")
+    info = f"{name}-{version}.dist-info"
+    content = {
+        f"{module}.py": code,
+        f"{info}/METADATA": f"Metadata-Version: 2.1\nName: {distribution}\nVersion: {version}\n",
+        f"{info}/WHEEL": "Wheel-Version: 1.0\nGenerator: test\nRoot-Is-Purelib: true\nTag: py3-none-any\n",
+    }
+    content[f"{info}/RECORD"] = "".join(f"{path},,\n" for path in (*content, f"{info}/RECORD"))
+    with zipfile.ZipFile(folder / f"{name}-{version}-py3-none-any.whl", "w") as wheel:
+        for path, text in content.items():
+            wheel.writestr(path, text)
+
+
+def constrained_version(distribution: str) -> str:
+    """What constraints.txt says."""
+    for line in (ROOT / "constraints.txt").read_text().splitlines():
+        name, _, version = line.partition("==")
+        if name.lower().replace("_", "-") == distribution:
+            return version
+    raise AssertionError(f"constraints.txt says nothing of {distribution}")
+
+
+def write_wheels(folder: Path, modules: Mapping[str, str]) -> None:
+    """A wheel for each module, named like its package and of the version of constraints.txt.
+
+    Of rich there is a later one as well, which does not work: constraints keep it away.
+    """
+    folder.mkdir()
+    for module, distribution in modules.items():
+        code = FAKE_TORCH if module == "torch" else ""
+        write_wheel(folder, distribution, constrained_version(distribution), module=module, code=code)
+    write_wheel(folder, "rich", "99.0", module="rich", code="raise ImportError('not tested yet')")

@@ -1,0 +1,72 @@
+"""What the words of the command line become."""
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import backend.__main__ as program
+from backend.commands.install import Plan
+from backend.wire.protocol import Job
+
+
+@pytest.fixture
+def jobs(monkeypatch: pytest.MonkeyPatch) -> list[Job]:
+    given: list[Job] = []
+    monkeypatch.setattr(program, "on_terminal", lambda job: given.append(job) or 0)
+    monkeypatch.setattr(program, "on_wire", lambda path: given.append(path) or 0)
+    return given
+
+
+def test_a_region_is_a_centre_and_a_radius(jobs: list[Job]) -> None:
+    assert program.run(["reconstruct", "photos", "--output", "o", "--region", "-1", "2.5", "-0.3", "4"]) == 0
+    assert (jobs[0].region_centre, jobs[0].region_radius) == ((-1.0, 2.5, -0.3), 4.0)
+
+
+def test_without_a_region_it_is_found(jobs: list[Job]) -> None:
+    assert program.run(["reconstruct", "photos", "--output", "o"]) == 0
+    assert (jobs[0].region_centre, jobs[0].region_radius) == (None, None)
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["photos", "--output", "o", "--region", "1", "2", "3", "0"], "must be positive"),
+        (["photos", "--output", "o", "--region", "1", "2", "nan", "1"], "finite"),
+        (["photos", "--output", "o", "--region", "1", "2", "3"], "expected 4"),
+        (["job.json", "--region", "1", "2", "3", "4"], "--region stands in the file"),
+    ],
+)
+def test_wrong_regions_end_with_a_sentence(
+    jobs: list[Job], words: list[str], message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as ended:
+        program.run(["reconstruct", *words])
+    assert ended.value.code == 2
+    assert message in capsys.readouterr().err
+    assert not jobs
+
+
+def test_install_and_remove_get_their_words(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[Any] = []
+    monkeypatch.setattr(program.install, "install", lambda plan: asked.append(plan) or 0)
+    monkeypatch.setattr(program.install, "remove", lambda folder: asked.append(folder) or 0)
+    program.run(["install", "--folder", "e"])
+    program.run(["install", "--folder", "e", "--torch", "cuda", "--again", "--requirements", "r"])
+    program.run(["install", "--folder", "e", "--remove"])
+    assert asked == [
+        Plan(folder=Path("e")),
+        Plan(folder=Path("e"), build="cuda", again=True, requirements_file=Path("r")),
+        Path("e"),
+    ]
+
+
+def test_a_rehearsal_gets_its_length_and_end(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[Any] = []
+    monkeypatch.setattr(program, "rehearse", lambda output, **options: asked.append((output, options)) or 0)
+    program.run(["rehearse"])
+    program.run(["rehearse", "--output", "o", "--seconds", "3", "--end", "crashed"])
+    assert asked == [
+        (None, {"seconds": 1.0, "end": "finished"}),
+        (Path("o"), {"seconds": 3.0, "end": "crashed"}),
+    ]
