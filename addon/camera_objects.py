@@ -221,7 +221,6 @@ def _hang(
 ) -> None:
     """Put the object where it belongs in the root's frame."""
     made.parent = root
-    made.matrix_parent_inverse = Matrix.Identity(4)
     made.matrix_basis = Matrix(root_from_object.tolist())
 
 

@@ -34,5 +34,5 @@ def world_from_solved_or_none(scene: bpy.types.Scene, job: PastJob) -> NDArray[n
     owner = frame_owner(job)
     if not has_own_frame(job) and owner == job.folder:
         return np.eye(4)
-    root = root_or_none(scene, str(owner))
+    root = root_or_none(scene, str(owner.absolute()))
     return None if root is None else np.array(root.matrix_world, np.float64)

@@ -16,7 +16,18 @@ from .operators.reconstruct import jobs_parent
 from .progress import seconds_left, stage_words, time_words
 from .properties import settings_of
 from .result_numbers import result_lines
-from .state_lines import StepState, cameras_state, images_state, region_state, result_state, solved_or_none
+from .state_lines import (
+    READY,
+    TODO,
+    StepState,
+    cameras_state,
+    images_state,
+    reconstruct_state,
+    region_state,
+    result_state,
+    solved_or_none,
+)
+from .view_cameras import generated
 
 _SILENCE_S = 30.0
 _MAIN_SCALE = 1.5
@@ -33,9 +44,13 @@ class _Panel:
 
 
 class _Step(_Panel):
-    """Mix-in: one of the five steps."""
+    """Mix-in: one of the five steps; its state is seen even where it is closed."""
 
     bl_parent_id = "FEWVIEW_PT_main"
+
+    def draw_header_preset(self, context: bpy.types.Context) -> None:
+        """At the right of the title."""
+        self.layout.label(icon=self.state(context).icon)
 
 
 class FEWVIEW_PT_main(_Panel, bpy.types.Panel):
@@ -51,7 +66,7 @@ class FEWVIEW_PT_main(_Panel, bpy.types.Panel):
             _draw_running(self.layout.box(), context, job)
         elif end is not None and (end.failure is not None or end.warnings):
             _draw_ended(self.layout.box(), context, end)
-        if job is None and backend_state(context)[0] is not State.READY:
+        if job is None and backend_state(context)[0] is State.NOT_READY:
             draw_environment(self.layout.box(), context)
 
 
@@ -75,15 +90,19 @@ class FEWVIEW_PT_images(_Step, bpy.types.Panel):
     bl_label = "1. Images"
     bl_idname = "FEWVIEW_PT_images"
 
+    def state(self, context: bpy.types.Context) -> StepState:
+        """How the step stands."""
+        return images_state(settings_of(context))
+
     def draw(self, context: bpy.types.Context) -> None:
         """Source, list, and what is wrong with it."""
         layout, settings = self.layout, settings_of(context)
-        _draw_state(layout, images_state(settings))
+        _draw_state(layout, self.state(context))
         layout.row().prop(settings, "source", expand=True)
         if settings.source == "RENDER":
             _draw_render(layout, context)
         elif not settings.images:
-            _main_button(layout, "fewview.add_images", icon="FILE_FOLDER", text="Add Photographs...")
+            _button(layout, "fewview.add_images", icon="FILE_FOLDER", text="Add Photographs...")
             _draw_text(layout, context, "3 to 20 pictures of one thing, each from a step further round it")
         if settings.images:
             _draw_list(layout, context)
@@ -94,11 +113,16 @@ class FEWVIEW_PT_cameras(_Step, bpy.types.Panel):
 
     bl_label = "2. Cameras"
     bl_idname = "FEWVIEW_PT_cameras"
+    bl_options = {"DEFAULT_CLOSED"}
+
+    def state(self, context: bpy.types.Context) -> StepState:
+        """How the step stands."""
+        return cameras_state(settings_of(context))
 
     def draw(self, context: bpy.types.Context) -> None:
         """Where they come from, and who could not be placed."""
         layout, settings = self.layout, settings_of(context)
-        _draw_state(layout, cameras_state(settings))
+        _draw_state(layout, self.state(context))
         layout.row().prop(settings, "camera_source", expand=True)
         known = settings.camera_source == "KNOWN"
         if known:
@@ -106,8 +130,9 @@ class FEWVIEW_PT_cameras(_Step, bpy.types.Panel):
         solved = solved_or_none(settings)
         text = "Load Cameras" if known else "Estimate Cameras"
         row = layout.row(align=True)
-        _main_button(row, "fewview.estimate_cameras", icon="OUTLINER_DATA_CAMERA", text=text)
+        row.operator("fewview.estimate_cameras", icon="OUTLINER_DATA_CAMERA", text=text)
         if solved is None:
+            _draw_text(layout, context, "Not needed: do it to see the cameras before the mesh")
             return
         row.operator("fewview.remove_cameras", icon="X", text="")
         if solved.reprojection_error_px is not None:
@@ -125,15 +150,20 @@ class FEWVIEW_PT_region(_Step, bpy.types.Panel):
     bl_idname = "FEWVIEW_PT_region"
     bl_options = {"DEFAULT_CLOSED"}
 
+    def state(self, context: bpy.types.Context) -> StepState:
+        """How the step stands."""
+        return region_state(settings_of(context))
+
     def draw(self, context: bpy.types.Context) -> None:
         """A sphere, or nothing."""
         layout, settings = self.layout, settings_of(context)
-        _draw_state(layout, region_state(settings))
+        _draw_state(layout, self.state(context))
         if settings.region is None:
-            _main_button(layout, "fewview.add_region", icon="SPHERE", text="Add Region")
+            layout.operator("fewview.add_region", icon="SPHERE")
+            _draw_text(layout, context, "Not needed: a sphere in the scene that you move and scale")
             return
         row = layout.row(align=True)
-        _main_button(row, "fewview.fit_region", icon="FULLSCREEN_EXIT", text="Fit to Subject")
+        row.operator("fewview.fit_region", icon="FULLSCREEN_EXIT", text="Fit to Subject")
         row.operator("fewview.remove_region", icon="X", text="")
         layout.prop(settings.region, "location")
         layout.prop(settings.region, "scale")
@@ -145,14 +175,20 @@ class FEWVIEW_PT_reconstruct(_Step, bpy.types.Panel):
     bl_label = "4. Reconstruct"
     bl_idname = "FEWVIEW_PT_reconstruct"
 
+    def state(self, context: bpy.types.Context) -> StepState:
+        """How the step stands."""
+        return reconstruct_state(settings_of(context))
+
     def draw(self, context: bpy.types.Context) -> None:
         """Preset and start."""
         layout, settings = self.layout, settings_of(context)
         layout.row().prop(settings, "preset", expand=True)
-        _main_button(layout, "fewview.reconstruct", icon="MOD_REMESH", text="Reconstruct")
-        reason = _why_not(context)
-        if reason:
-            _draw_text(layout, context, reason)
+        ready = reconstruct_state(settings).icon != TODO
+        row = layout.row()
+        row.enabled = ready
+        _button(row, "fewview.reconstruct", icon="MOD_REMESH", text="Reconstruct", main=ready)
+        if not ready:
+            _draw_text(layout, context, "Add photographs in step 1 first")
 
 
 class FEWVIEW_PT_advanced(_Panel, bpy.types.Panel):
@@ -180,10 +216,14 @@ class FEWVIEW_PT_result(_Step, bpy.types.Panel):
     bl_label = "5. Result"
     bl_idname = "FEWVIEW_PT_result"
 
+    def state(self, context: bpy.types.Context) -> StepState:
+        """How the step stands."""
+        return result_state(settings_of(context))
+
     def draw(self, context: bpy.types.Context) -> None:
         """The mesh, how far to trust it, and what to do with it."""
         layout, settings = self.layout, settings_of(context)
-        _draw_state(layout, result_state(settings))
+        _draw_state(layout, self.state(context))
         if settings.result is None:
             return
         folder = settings.result.get("fewview_job", "")
@@ -196,7 +236,9 @@ class FEWVIEW_PT_result(_Step, bpy.types.Panel):
         row.operator("fewview.show_error")
         _draw_text(layout, context, legend(settings.result.data))
         if settings.target is not None:
-            layout.operator("fewview.measure_error", icon="DRIVER_DISTANCE")
+            row = layout.row(align=True)
+            row.operator("fewview.measure_error", icon="DRIVER_DISTANCE")
+            row.prop(settings.target, "hide_viewport", text="", emboss=True)
             numbers = numbers_of(settings.result)
             if numbers is not None:
                 _draw_text(layout, context, numbers.text)
@@ -229,22 +271,26 @@ class FEWVIEW_PT_past_jobs(_Panel, bpy.types.Panel):
 
 def draw_environment(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
     """Whether there is a Python that can reconstruct, and how to get one."""
-    readiness, text = backend_state(context)
-    if readiness is State.READY:
-        layout.label(text="Backend ready", icon="CHECKMARK")
+    state, text = backend_state(context)
+    if state is State.READY:
+        layout.label(text="Ready to reconstruct", icon=READY)
         _draw_text(layout, context, text)
-    else:
-        layout.label(text="Set up FewView once", icon="INFO")
-        _draw_text(layout, context, text)
-    column = layout.column(align=True)
-    if readiness is State.NOT_READY:
-        _main_button(column, "fewview.install_backend", icon="IMPORT", text="Set Up...")
-    elif readiness is State.UNKNOWN:
-        _main_button(column, "fewview.check_backend", icon="CHECKMARK", text="Check")
-    else:
-        column.operator("fewview.check_backend")
-        column.operator("fewview.install_backend", text="Set Up Again...")
-    column.operator("fewview.copy_install_lines", icon="COPYDOWN")
+        return
+    if state is State.UNKNOWN:
+        layout.label(text="Not checked yet", icon="INFO")
+        _button(layout, "fewview.check_backend", icon="CHECKMARK", text="Check")
+        return
+    layout.label(text="Set up FewView once", icon="INFO")
+    _draw_text(layout, context, text)
+    _draw_text(layout, context, "It computes in a Python of its own, which is downloaded for it")
+    _button(layout, "fewview.install_backend", icon="IMPORT", text="Set Up...")
+    if not bpy.app.online_access:
+        _draw_text(layout, context, "Allow Online Access in Preferences > System first", icon="ERROR")
+        show = layout.operator("screen.userpref_show", text="Open Preferences", icon="PREFERENCES")
+        show.section = "SYSTEM"
+    row = layout.row(align=True)
+    row.operator("fewview.check_backend", text="Check Again")
+    row.operator("fewview.copy_install_lines", text="By Hand", icon="COPYDOWN")
 
 
 def _draw_running(layout: bpy.types.UILayout, context: bpy.types.Context, job: jobs.RunningJob) -> None:
@@ -302,10 +348,15 @@ def _draw_render(layout: bpy.types.UILayout, context: bpy.types.Context) -> None
             column.prop(settings, "arc")
         if settings.layout != "HEMISPHERE":
             column.prop(settings, "elevation")
-        layout.operator("fewview.generate_views", icon="OUTLINER_OB_CAMERA")
+        made = bool(generated(context.scene))
+        text = "Generate Again" if made else "Generate Cameras"
+        _button(layout, "fewview.generate_views", icon="OUTLINER_OB_CAMERA", text=text, main=not made)
     elif settings.view_cameras == "ANIMATED":
         column.prop(settings, "frame_step")
-    _main_button(layout, "fewview.render_views", icon="RENDER_STILL", text="Render Views")
+    ready = settings.view_cameras != "GENERATED" or made
+    if ready:
+        main = not settings.images
+        _button(layout, "fewview.render_views", icon="RENDER_STILL", text="Render Views", main=main)
 
 
 class FEWVIEW_PT_render(_Panel, bpy.types.Panel):
@@ -353,18 +404,10 @@ def _draw_list(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
         _draw_text(layout, context, problem, icon="ERROR")
 
 
-def _why_not(context: bpy.types.Context) -> str:
-    """What has to be done before Reconstruct can be pressed; empty where it can."""
-    if jobs.running() is not None:
-        return ""
-    if images_state(settings_of(context)).icon != "CHECKMARK" and not settings_of(context).images:
-        return "Add photographs in step 1 first"
-    return ""
-
-
-def _main_button(layout: bpy.types.UILayout, operator: str, *, icon: str, text: str) -> None:
+def _button(layout: bpy.types.UILayout, operator: str, *, icon: str, text: str, main: bool = True) -> None:
+    """A button; the one to press next is larger."""
     row = layout.row()
-    row.scale_y = _MAIN_SCALE
+    row.scale_y = _MAIN_SCALE if main else 1.0
     row.operator(operator, icon=icon, text=text)
 
 

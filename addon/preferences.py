@@ -1,9 +1,13 @@
 """The add-on's preferences: which Python reconstructs, and where jobs go."""
 
+from types import SimpleNamespace
+
 import bpy
 from bpy.props import EnumProperty, StringProperty
 
 from .. import __package__ as EXTENSION
+
+_DEFAULTS = SimpleNamespace(backend_python="", environment_folder="", torch_build="cpu", output="~/FewView")
 
 
 class FEWVIEW_AP_preferences(bpy.types.AddonPreferences):
@@ -33,7 +37,7 @@ class FEWVIEW_AP_preferences(bpy.types.AddonPreferences):
         name="Output",
         description="Folder for the jobs of .blend files that are not saved yet",
         subtype="DIR_PATH",
-        default="~/FewView",
+        default=_DEFAULTS.output,
     )
 
     def draw(self, context: bpy.types.Context) -> None:
@@ -45,12 +49,17 @@ class FEWVIEW_AP_preferences(bpy.types.AddonPreferences):
         draw_environment(layout, context)
         layout.prop(self, "backend_python")
         layout.prop(self, "environment_folder")
+        layout.prop(self, "torch_build")
         layout.prop(self, "output")
 
 
 CLASSES = (FEWVIEW_AP_preferences,)
 
 
-def preferences_of(context: bpy.types.Context) -> FEWVIEW_AP_preferences:
-    """The preferences of this add-on."""
-    return context.preferences.addons[EXTENSION].preferences
+def preferences_of(context: bpy.types.Context) -> FEWVIEW_AP_preferences | SimpleNamespace:
+    """The preferences of this add-on; their defaults where Blender has none.
+
+    It has none where the add-on was enabled for this session alone, as `blender --addons` does.
+    """
+    found = context.preferences.addons.get(EXTENSION)
+    return _DEFAULTS if found is None else found.preferences

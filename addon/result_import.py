@@ -9,10 +9,11 @@ from numpy.typing import NDArray
 
 from . import undo_step
 from .camera_objects import CameraImport, import_steps, read_import, root_or_none
+from .frames import frame_owner, has_own_frame, world_from_solved_or_none
 from .job_folder import CAMERAS, MESH, PastJob, inside, read_job
 from .mesh_import import MeshImport, import_mesh, read_in_steps, scene_named
 from .placing import upright_from_solved
-from .solved import SolvedScene
+from .solved import SolvedScene, read_solved
 
 
 def import_result_steps(
@@ -20,23 +21,22 @@ def import_result_steps(
 ) -> Iterator[None]:
     """Import the mesh of a job, and its cameras, in steps short enough for a timer, as one undo step.
 
-    Give `undo` False where an operator makes the undo step itself. The mesh is read first: where it
-    cannot be used, the scene is left as it is. Raises FolderError, ValueError or OSError with a sentence
-    for the user.
+    The cameras of an earlier job that this one was given are left as they are. Give `undo` False where an
+    operator makes the undo step itself. The mesh is read first: where it cannot be used, the scene is left
+    as it is. Raises FolderError, ValueError or OSError with a sentence for the user.
     """
     job = read_job(folder)
     mesh = yield from read_in_steps(inside(job.folder, job.result / MESH))
     found = _cameras_or_none(job)
     yield
-    if cameras and found is not None:
+    if cameras and found is not None and frame_owner(job) == job.folder:
         yield from import_steps(scene_name, found)
-    solved = None if found is None else found.solved
     scene = scene_named(scene_name)
-    root = None if solved is None or not solved.estimated else _root_or_none(scene, job)
+    root = root_or_none(scene, str(frame_owner(job).absolute()))
     wanted = MeshImport(
         job=str(job.folder.absolute()),
         scene_name=scene_name,
-        world_from_solved=world_from_solved(scene, job, solved),
+        world_from_solved=world_from_solved(scene, job, None if found is None else found.solved),
         parent_uid=None if root is None else root.session_uid,
     )
     yield from import_mesh(mesh, wanted)
@@ -44,34 +44,39 @@ def import_result_steps(
         undo_step.push(f"Import {job.folder.name}")
 
 
+def show_estimated_cameras(path: Path, job: PastJob, scene_name: str) -> Iterator[None]:
+    """Show cameras that a running job has found, so that its previews have a place; none that were known."""
+    if has_own_frame(job):
+        solved = read_solved(path)
+        yield
+        wanted = CameraImport(
+            job=str(job.folder.absolute()), solved=solved, photographs=_photographs(job), points=None
+        )
+        yield from import_steps(scene_name, wanted)
+
+
 def world_from_solved(
     scene: bpy.types.Scene, job: PastJob, solved: SolvedScene | None
 ) -> NDArray[np.float64]:
     """(4, 4): where the job's frame lies in the scene.
 
-    Known cameras stand in the world already. Estimated ones are placed by their root, which the user may
-    have moved, or upright where there is none.
+    Estimated cameras are placed by their root, which the user may have moved; without one they are put
+    upright, as a root would be.
     """
-    if solved is None or not solved.estimated:
-        return np.eye(4)
-    root = _root_or_none(scene, job)
-    if root is not None:
-        return np.array(root.matrix_world, np.float64)
-    if solved.region_centre is None or solved.region_radius is None:
+    placed = world_from_solved_or_none(scene, job)
+    if placed is not None:
+        return placed
+    if solved is None or solved.region_centre is None or solved.region_radius is None:
         return np.eye(4)
     return upright_from_solved(solved.poses, np.array(solved.region_centre), solved.region_radius)
-
-
-def _root_or_none(scene: bpy.types.Scene, job: PastJob) -> bpy.types.Object | None:
-    """The job's own root, or else the one that the scene's settings name."""
-    chosen = scene.fewview.root
-    return root_or_none(scene, str(job.folder.absolute())) or (
-        chosen if chosen in scene.objects.values() else None
-    )
 
 
 def _cameras_or_none(job: PastJob) -> CameraImport | None:
     """The job's cameras and points, as far as there are any."""
     if not inside(job.folder, job.result / CAMERAS).is_file():
         return None
-    return read_import(job.folder, tuple(job.folder / image for image in job.job.images))
+    return read_import(job.folder, _photographs(job))
+
+
+def _photographs(job: PastJob) -> tuple[Path, ...]:
+    return tuple(job.folder / image for image in job.job.images)

@@ -10,7 +10,9 @@ from .operators.images import list_problems
 from .properties import FEWVIEW_PG_settings
 from .solved import SolvedScene, read_solved
 
-READY, TODO, TROUBLE = "CHECKMARK", "RADIOBUT_OFF", "ERROR"
+READY, TODO, TROUBLE, AUTOMATIC = "CHECKMARK", "RADIOBUT_OFF", "ERROR", "AUTO"
+FEWEST_IMAGES = 2
+"""Two photographs are reconstructed, though three are better."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,14 +47,23 @@ def cameras_state(settings: FEWVIEW_PG_settings) -> StepState:
         if not Path(bpy.path.abspath(settings.cameras_path)).exists():
             return StepState(icon=TROUBLE, text="The file is missing")
         return StepState(icon=READY, text="Known")
-    return StepState(icon=TODO, text="Estimated when you reconstruct")
+    return StepState(icon=AUTOMATIC, text="Estimated when you reconstruct")
 
 
 def region_state(settings: FEWVIEW_PG_settings) -> StepState:
     """Step 3."""
     if settings.region is None:
-        return StepState(icon=TODO, text="Found automatically")
+        return StepState(icon=AUTOMATIC, text="Found automatically")
     return StepState(icon=READY, text="Set by the sphere in the scene")
+
+
+def reconstruct_state(settings: FEWVIEW_PG_settings) -> StepState:
+    """Step 4."""
+    if sum(image.use for image in settings.images) < FEWEST_IMAGES:
+        return StepState(icon=TODO, text="Photographs are needed first")
+    if settings.result is None:
+        return StepState(icon="PLAY", text="Ready to start")
+    return StepState(icon=READY, text="Done; start again as you like")
 
 
 def result_state(settings: FEWVIEW_PG_settings) -> StepState:

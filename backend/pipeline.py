@@ -223,6 +223,7 @@ def _reconstructed(
     solved, region, device = placed
     views = solved.views
     previews = Previews(this.workspace, this.listener.previewed)
+    previews.show_cameras(solved, region)
     stereo = this.stage("stereo", partial(stages.match_views, views, region, settings.stereo, device=device))
     previews.show_points(stereo.points, region)
     chance = {"device": device, "generator": torch.Generator(device).manual_seed(job.seed)}

@@ -1,5 +1,6 @@
-"""What a run shows of itself while it goes on: points, then meshes of the unfinished surface."""
+"""What a run shows of itself while it goes on: cameras, points, then meshes of the unfinished surface."""
 
+import json
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -9,8 +10,9 @@ from pathlib import Path
 import numpy as np
 
 from .mesh_files import write_mesh, write_points
-from .scene import Region, SurfacePoints, transform_points
+from .scene import Region, SolvedCameras, SurfacePoints, transform_points
 from .stages.mesh import preview_mesh
+from .stages.nerfstudio import transforms_json
 from .stages.train import Surface
 from .workspace import Workspace
 
@@ -42,6 +44,11 @@ class Previews:
         self._not_before_s = clock()
         workspace.remove_previews()
 
+    def show_cameras(self, solved: SolvedCameras, region: Region) -> None:
+        """Say where the photographs were taken: a viewer needs it to place what follows."""
+        content = json.dumps(transforms_json(solved, region), allow_nan=False)
+        self._show(lambda path: path.write_text(content, encoding="utf-8"), self._clock(), ".json")
+
     def show_points(self, points: SurfacePoints, region: Region) -> None:
         """Show some of the stereo points: there may be a million."""
         few = _spread(points, _POINTS_SHOWN)
@@ -58,9 +65,9 @@ class Previews:
         if mesh is not None:
             self._show(partial(write_mesh, mesh=mesh), started_s)
 
-    def _show(self, write: Callable[[Path], object], started_s: float) -> None:
+    def _show(self, write: Callable[[Path], object], started_s: float, suffix: str = ".ply") -> None:
         self._number += 1
-        path = self._workspace.preview_path(self._number)
+        path = self._workspace.preview_path(self._number, suffix)
         write(path)
         ended_s = self._clock()
         self._not_before_s = ended_s + max(_SHORTEST_PAUSE_S, (ended_s - started_s) / _LARGEST_SHARE)

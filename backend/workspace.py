@@ -62,13 +62,13 @@ class Workspace:
         """Where the log of all runs is."""
         return self.folder / LOG
 
-    def preview_path(self, number: int) -> Path:
+    def preview_path(self, number: int, suffix: str) -> Path:
         """Where the run's first, second ... preview is to be seen."""
-        return self.private / f"preview-{number}.ply"
+        return self.private / f"preview-{number}{suffix}"
 
     def remove_previews(self) -> None:
         """Without those of earlier runs."""
-        for path in self.private.glob("preview*.ply"):
+        for path in self.private.glob("preview*.*"):
             with suppress(OSError):  # on Windows somebody may still be looking at it
                 path.unlink()
 

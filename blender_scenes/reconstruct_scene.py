@@ -66,7 +66,7 @@ def enable_extension() -> None:
         return
     for module in addon_utils.modules(refresh=True):
         if module.__name__.startswith("bl_ext.") and module.__name__.endswith(".fewview"):
-            addon_utils.enable(module.__name__)
+            bpy.ops.preferences.addon_enable(module=module.__name__)
             return
     raise NotInstalled("the FewView extension is not installed: install its zip in Blender first")
 

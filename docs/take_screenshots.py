@@ -7,7 +7,9 @@ The pictures are of the sidebar alone, and two of the viewport with the result. 
 """
 
 import argparse
+import importlib
 import os
+import subprocess
 import sys
 import tempfile
 import traceback
@@ -16,6 +18,7 @@ from pathlib import Path
 
 import bpy
 import numpy as np
+from numpy.typing import NDArray
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
@@ -24,10 +27,8 @@ from blender_scenes.lighting import light_scene
 from blender_scenes.reconstruct_scene import enable_extension
 from blender_scenes.scenes import SCENES, build_scene
 
-SIDEBAR_PX = 330
 SETTLE_S = 0.7
 """Until what was changed is on the screen; drawing is slow where there is no GPU."""
-LIMIT_S = 420.0
 
 
 def tour(output: Path) -> Iterator[float]:
@@ -71,6 +72,7 @@ def tour(output: Path) -> Iterator[float]:
     bpy.ops.fewview.show_support()
     yield from photographed(output / "result_support.png", whole=True)
 
+    # Something to fail on.
     settings.images[0].path = str(output / "not_there.png")
     bpy.ops.fewview.reconstruct()
     yield from until_idle()
@@ -102,43 +104,66 @@ def opened_sidebar() -> Iterator[float]:
 def photographed(path: Path, *, whole: bool = False) -> Iterator[float]:
     """Write the sidebar, or the whole viewport, as a PNG."""
     area = view()
-    region = next(region for region in area.regions if region.type == "UI")
-    if region.active_panel_category != "FewView":
-        region.active_panel_category = "FewView"
+    sidebar = next(region for region in area.regions if region.type == "UI")
+    if whole:
+        main_region = next(region for region in area.regions if region.type == "WINDOW")
+        with bpy.context.temp_override(window=window(), area=area, region=main_region):
+            bpy.ops.view3d.view_all()
     area.tag_redraw()
     yield SETTLE_S
-    with bpy.context.temp_override(window=bpy.context.window_manager.windows[0], area=area):
-        if whole:
-            bpy.ops.view3d.view_all()
-            yield SETTLE_S
-    with bpy.context.temp_override(window=bpy.context.window_manager.windows[0], area=area):
-        bpy.ops.screen.screenshot_area(filepath=str(path))
-    if not whole:
-        keep_columns(path, region.x - area.x, region.width)
+    shown = area if whole else sidebar
+    picture = window_picture()[shown.y : shown.y + shown.height, shown.x : shown.x + shown.width]
+    write_png(path, picture if whole else without_empty_rows(picture))
     sys.stderr.write(f"{path}\n")
 
 
-def keep_columns(path: Path, first: int, count: int) -> None:
-    """Cut the picture to some of its columns."""
+def window_picture() -> NDArray[np.float32]:
+    """(height, width, 4): what is in the window, bottom row first."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "window.png"
+        with bpy.context.temp_override(window=window()):
+            bpy.ops.screen.screenshot(filepath=str(path))
+        picture = read_png(path)
+        if not picture[..., :3].any():  # a screen drawn in software: the X server knows better
+            subprocess.run(["import", "-window", "root", str(path)], check=True)
+            picture = read_png(path)
+    return picture
+
+
+def without_empty_rows(picture: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Without the part at the bottom where no panel is."""
+    same = np.ptp(picture[:, :-20, :3], axis=1).max(axis=-1) < 0.02  # the scroll bar is on the right
+    first = int(np.argmin(same))
+    return picture[max(first - 12, 0) :]
+
+
+def read_png(path: Path) -> NDArray[np.float32]:
+    """(height, width, 4), bottom row first."""
     image = bpy.data.images.load(str(path))
     width, height = image.size
     pixels = np.empty(width * height * 4, np.float32)
     image.pixels.foreach_get(pixels)
-    cut = pixels.reshape(height, width, 4)[:, first : first + count]
     bpy.data.images.remove(image)
-    made = bpy.data.images.new("cut", cut.shape[1], height)
-    made.pixels.foreach_set(np.ascontiguousarray(cut).ravel())
+    return pixels.reshape(height, width, 4)
+
+
+def write_png(path: Path, picture: NDArray[np.float32]) -> None:
+    """An 8-bit PNG of (height, width, 4), bottom row first."""
+    made = bpy.data.images.new("picture", picture.shape[1], picture.shape[0])
+    made.pixels.foreach_set(np.ascontiguousarray(picture).ravel())
     made.filepath_raw, made.file_format = str(path), "PNG"
     made.save()
     bpy.data.images.remove(made)
 
 
+def window() -> bpy.types.Window:
+    """Blender's window."""
+    return bpy.context.window_manager.windows[0]
+
+
 def until_idle() -> Iterator[float]:
     """Wait for the running job."""
-    import importlib
-
-    package = type(bpy.context.preferences.addons.get(extension_name()).preferences).bl_idname
-    jobs = importlib.import_module(f"{package}.addon.jobs")
+    jobs = importlib.import_module(f"{extension_name()}.addon.jobs")
     while jobs.running() is not None:
         yield 0.2
     end = jobs.ended()
@@ -153,8 +178,7 @@ def extension_name() -> str:
 
 def view() -> bpy.types.Area:
     """The 3D viewport."""
-    screen = bpy.context.window_manager.windows[0].screen
-    return next(area for area in screen.areas if area.type == "VIEW_3D")
+    return next(area for area in window().screen.areas if area.type == "VIEW_3D")
 
 
 def main(words: list[str]) -> None:

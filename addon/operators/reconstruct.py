@@ -17,12 +17,11 @@ from ..preferences import preferences_of
 from ..properties import FEWVIEW_PG_settings, settings_of
 from ..region import region_of
 from ..report_text import report_text
-from ..result_import import import_result_steps
+from ..result_import import import_result_steps, show_estimated_cameras
 from ..solved import read_solved
+from ..state_lines import FEWEST_IMAGES
 from .environment import backend_python_or_reason
 from .images import used_images
-
-FEWEST_IMAGES = 2
 
 
 def jobs_parent(context: bpy.types.Context, given: str = "") -> Path:
@@ -156,8 +155,12 @@ def start(python: Path, folder: Path, asked: Job, *, scene_name: str) -> None:
     """
     path = write_job(folder, asked)
 
+    job = PastJob(folder=folder, job=asked)
+
     def on_preview(shown: Path) -> jobs.Steps:
-        job = PastJob(folder=folder, job=asked)
+        if shown.suffix == ".json":
+            yield from show_estimated_cameras(shown, job, scene_name)
+            return
         frame = world_from_solved_or_none(scene_named(scene_name), job)
         if frame is not None:
             wanted = MeshImport(job=str(folder), scene_name=scene_name, world_from_solved=frame)

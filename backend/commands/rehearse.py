@@ -25,7 +25,7 @@ _FEWEST_STEPS = 10
 """Of a stage."""
 _LONGEST_STEP_S = 0.1
 """The time in which a request to stop is heard."""
-_PREVIEW = "preview.ply"
+_PREVIEW, _CAMERAS_PREVIEW = "preview.ply", "preview.json"
 
 
 def rehearse(output: Path | None, seconds: float = 1.0, *, end: str = "finished") -> int:
@@ -55,6 +55,9 @@ def _play(output: Path | None, seconds: float, end: str, request: CancelRequest,
         _play_stage(name, stage_s, request, speaking)
         if name == "cameras":
             speaking.say(protocol.Warned(text="This is a rehearsal: no photograph is read."))
+            if output is not None:
+                path = _put(output / _CAMERAS_PREVIEW, files.write_cameras)
+                speaking.say(protocol.Preview(path=str(path)))
         if name == "train":
             _make_trouble(end)
         if name in ("stereo", "train") and output is not None:

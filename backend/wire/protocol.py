@@ -1,9 +1,9 @@
 """What the backend and its caller say to each other: one JSON object a line, decoded strictly.
 
-The backend speaks first: `Hello`, then any of `Stage`, `Progress`, `Preview`, `Checked`, `Warned`, `Heartbeat`,
-then exactly one `Finished` or `Failed`, which is the last line. The caller may write `Cancel`; closing
-the pipe says the same. Large data travels by file path. Standard library only: both sides import this
-one file, so neither can misspell the other.
+The backend speaks first: `Hello`, then any of `Stage`, `Progress`, `Preview`, `Checked`, `Warned`,
+`Heartbeat`, then exactly one `Finished` or `Failed`, which is the last line. The caller may write
+`Cancel`; closing the pipe says the same. Large data travels by file path. Standard library only: both
+sides import this one file, so neither can misspell the other.
 """
 
 import json
@@ -91,7 +91,7 @@ class Progress:
 
 @dataclass(frozen=True, kw_only=True)
 class Preview:
-    """A file that shows the result so far; it stays valid until the next one or the end."""
+    """A file that shows the result so far: cameras as a .json, points or a mesh as a .ply."""
 
     path: str
 

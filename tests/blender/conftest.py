@@ -52,7 +52,11 @@ def extension(extension_zip: Path) -> Iterator[str]:
 @pytest.fixture
 def scene(extension: str) -> object:
     """An empty scene with the add-on's settings."""
+    import addon_utils
     import bpy
+
+    if extension not in bpy.context.preferences.addons:  # factory settings, read by another test
+        addon_utils.enable(extension, default_set=True)
 
     bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
     return bpy.context.scene

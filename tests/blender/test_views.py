@@ -567,8 +567,9 @@ def painted(cube: Any, tmp_path: Path) -> Any:
 
 
 def test_a_second_blender_renders_what_is_not_saved(
-    painted: Any, second_blender: ModuleType, tmp_path: Path
+    painted: Any, second_blender: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr(second_blender, "clean", lambda _: None)  # here: the second one cleans by itself
     painted.location.x = 7.0  # since the file was saved
     generate(view_count=2)
     before = {path: path.read_bytes() for path in (tmp_path / "own").rglob("*") if path.is_file()}
@@ -598,6 +599,17 @@ def test_an_error_in_the_second_blender_reaches_the_first(
         bpy.ops.fewview.render_views(output=str(tmp_path), **SMALL)
     assert not (tmp_path / "views-001/transforms.json").exists()
     assert not (tmp_path / "views-001" / second_blender.COPY).exists()
+
+
+def test_nothing_is_left_of_a_second_blender_that_does_not_start(
+    cube: Any, second_blender: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    generate(view_count=2)
+    command = (sys.executable, "-c", "raise SystemExit(3)")
+    monkeypatch.setattr(second_blender, "worker_command", lambda _: command)
+    with pytest.raises(RuntimeError, match="exit code 3"):
+        bpy.ops.fewview.render_views(output=str(tmp_path), **SMALL)
+    assert [path.name for path in (tmp_path / "views-001").iterdir()] == ["render.log"]
 
 
 @pytest.mark.parametrize("samples", [1, 100_000])

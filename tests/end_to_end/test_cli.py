@@ -169,9 +169,10 @@ def test_rehearse_plays_the_whole_conversation_without_any_package(case: Case) -
     assert set(heard[-1].files) >= {"mesh.ply", "cameras.json", "sparse.ply", "report.json", "report.html"}
     assert all((case.output / name).exists() for name in heard[-1].files)
     assert not list(case.output.glob("*.part"))
-    previews = [message.path for message in heard if isinstance(message, protocol.Preview)]
-    assert previews
-    assert all(len(read_mesh(Path(path)).faces) == 4 for path in previews)
+    previews = [Path(message.path) for message in heard if isinstance(message, protocol.Preview)]
+    assert [path.suffix for path in previews] == [".json", ".ply", ".ply"]
+    assert len(json.loads(previews[0].read_text())["frames"]) == 3
+    assert len(read_mesh(previews[-1]).faces) == 4
 
 
 def rehearsal(call: str) -> subprocess.Popen[str]:
@@ -470,12 +471,14 @@ def test_a_region_on_the_command_line(case: Case) -> None:
     assert region["radius_world"] == pytest.approx(2.5)
 
 
-def test_previews_are_points_then_whole_meshes(case: Case) -> None:
+def test_previews_are_cameras_then_points_then_whole_meshes(case: Case) -> None:
     """Long enough after each other: fitting takes 1.2 s."""
     converse(case, until="cameras")
     heard = converse(case, step_s=0.12)
     names = [m.name if isinstance(m, protocol.Stage) else m for m in heard]
-    points, mesh = (m for m in heard if isinstance(m, protocol.Preview))
+    cameras, points, mesh = (m for m in heard if isinstance(m, protocol.Preview))
+    assert names.index(cameras) < names.index("stereo")
+    assert len(json.loads(Path(cameras.path).read_text())["frames"]) > 1
     assert names.index("stereo") < names.index(points) < names.index("train") < names.index(mesh)
     assert b"element face" not in Path(points.path).read_bytes()
     assert len(read_mesh(Path(mesh.path)).faces) > 100
