@@ -1,16 +1,20 @@
 # Each target makes what it needs, once. From nothing: Python 3.11 and an internet connection or package mirror.
 PYTHON ?= python3.11
 BACKEND := .venv/bin/python
-BLENDER := .venv-blender/bin/python
+BPY := .venv-blender/bin/python
+BLENDER ?= blender
 DEMO := build/demo
 
-.PHONY: help demo test check benchmark
+.PHONY: help demo test test-blender check benchmark extension screenshots
 .DELETE_ON_ERROR:
 
 help:
 	@echo "make demo    render 6 views of a scene, reconstruct it, measure the error"
 	@echo "make test    run all tests"
 	@echo "make check   style and types"
+	@echo "make extension   the zip to install in Blender"
+	@echo "make test-blender BLENDER=blender   the add-on's tests in a real Blender"
+	@echo "make screenshots BLENDER=blender    the pictures of the add-on in docs/images"
 	@echo "make benchmark   speed against error, as a table"
 
 demo: .venv/.ready $(DEMO)/scene/transforms.json
@@ -18,13 +22,36 @@ demo: .venv/.ready $(DEMO)/scene/transforms.json
 	    --truth $(DEMO)/scene/truth.ply --output $(DEMO)/result
 
 $(DEMO)/scene/transforms.json: .venv-blender/.ready $(wildcard blender_scenes/*.py)
-	$(BLENDER) -m blender_scenes.render_views --scene monkey --views 6 --layout arc --arc-deg 120 \
+	$(BPY) -m blender_scenes.render_views --scene monkey --views 6 --layout arc --arc-deg 120 \
 	    --output $(DEMO)/scene
+
+# Blender's Python has no jaxtyping: its tests run without the shape checks of pyproject.toml.
+BLENDER_TESTS := -o addopts="--strict-markers --import-mode=importlib" tests/blender
 
 test: .venv/.ready .venv-blender/.ready
 	$(BACKEND) -m pytest --ignore=tests/blender
-	@# Blender's Python has no jaxtyping: its tests run without the shape checks of pyproject.toml.
-	$(BLENDER) -m pytest -o addopts="--strict-markers --import-mode=importlib" tests/blender
+	FEWVIEW_PYTHON=$(abspath $(BACKEND)) $(BPY) -m pytest $(BLENDER_TESTS)
+
+# A Blender with settings of its own: the tests install the extension, and must not touch the user's.
+# BLENDER may be several words; what it needs to be told is in the environment.
+IN_BLENDER = FEWVIEW_PYTHON=$(abspath $(BACKEND)) BLENDER_USER_RESOURCES=$(abspath build/blender-settings) $(BLENDER)
+
+test-blender: .venv/.ready build/pytest/.ready
+	rm -rf build/blender-settings && mkdir -p build/blender-settings
+	$(IN_BLENDER) --background --factory-startup --python-exit-code 1 \
+	    --python tests/blender/run_in_blender.py -- build/pytest $(TESTS)
+
+extension: .venv-blender/.ready
+	$(BPY) tests/blender/build_extension.py --output build
+
+screenshots: .venv/.ready extension
+	rm -rf build/blender-settings && mkdir -p build/blender-settings
+	$(IN_BLENDER) --command extension install-file --repo user_default --enable build/fewview-*.zip
+	$(IN_BLENDER) --factory-startup --python docs/take_screenshots.py -- --output docs/images
+
+build/pytest/.ready: .venv-blender/.ready
+	$(BPY) -m pip install --quiet --constraint constraints-blender.txt --target build/pytest pytest
+	@touch $@
 
 check: .venv/.ready
 	$(BACKEND) -m ruff check
@@ -41,7 +68,7 @@ benchmark: .venv/.ready $(addsuffix /transforms.json,$(SCENES))
 
 # A scene's folder is its name and its number of views: three are taken over 40 degrees, six over 120.
 $(BENCHMARK)/scenes/%/transforms.json: .venv-blender/.ready $(wildcard blender_scenes/*.py)
-	$(BLENDER) -m blender_scenes.render_views --scene $(firstword $(subst _, ,$*)) \
+	$(BPY) -m blender_scenes.render_views --scene $(firstword $(subst _, ,$*)) \
 	    --views $(lastword $(subst _, ,$*)) --layout arc \
 	    --arc-deg $(if $(filter 3,$(lastword $(subst _, ,$*))),40,120) --output $(@D)
 
@@ -52,5 +79,5 @@ $(BENCHMARK)/scenes/%/transforms.json: .venv-blender/.ready $(wildcard blender_s
 
 .venv-blender/.ready: constraints-blender.txt
 	$(PYTHON) -m venv .venv-blender
-	$(BLENDER) -m pip install --quiet --constraint constraints-blender.txt bpy pytest
+	$(BPY) -m pip install --quiet --constraint constraints-blender.txt bpy pytest
 	@touch $@

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import bpy
 
-from ..backend.wire.protocol import PROTOCOL_VERSION, Failed, Job
+from ..backend.wire.protocol import PROTOCOL_VERSION, Failed, Job, decode_job, encode_job
 from . import jobs
 from .job_folder import RESULT, new_folder
 from .operators.environment import backend_python_or_reason
@@ -53,8 +53,9 @@ def reconstruct(
     """Reconstruct from image files or folders, wait, and bring the mesh into the scene.
 
     The job gets a folder of its own in `output`. `cameras` are known ones: a transforms.json or a COLMAP
-    model; `region` is a centre and a radius in their frame. Raises JobError where nothing can be started,
-    ValueError for arguments that make no sense, ReconstructionFailed where the backend gives up.
+    model; `region` is a centre and a radius in their frame. Nothing is taken from the panel. Raises
+    JobError where nothing can be started, ValueError for arguments that make no sense, ReconstructionFailed
+    where the backend gives up.
     """
     python, reason = backend_python_or_reason(bpy.context)
     if python is None:
@@ -72,12 +73,22 @@ def reconstruct(
         region_centre=None if region is None else tuple(map(float, region[0])),
         region_radius=None if region is None else float(region[1]),
     )
+    _check(asked)
     folder = new_folder(Path(output).absolute(), "reconstruct")
     start(python, folder, asked, scene_name=bpy.context.scene.name)
     end = jobs.wait()
     if end.failure is not None:
         raise ReconstructionFailed(end.failure)
     return Reconstruction(mesh=settings_of(bpy.context).result, folder=folder, warnings=end.warnings)
+
+
+def _check(asked: Job) -> None:
+    """What can be known before a folder is made. Raises ValueError."""
+    decode_job(encode_job(asked))
+    named = (*asked.images, *filter(None, (asked.cameras, asked.masks, asked.truth)))
+    missing = [path for path in named if not Path(path).exists()]
+    if not asked.images or missing:
+        raise ValueError(f"There is nothing at {', '.join(missing) or 'no path'}: check the path")
 
 
 def _absolute(path: Path | str | None) -> str | None:

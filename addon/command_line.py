@@ -14,14 +14,16 @@ from pathlib import Path
 
 import bpy
 
-from ..backend.wire.protocol import CANCELLED, CRASHED, DEVICES, PRESETS
+from ..backend.wire.protocol import CANCELLED, CRASHED, DEVICES, PRESETS, PROTOCOL_BROKEN
 from . import jobs
 from .api import ReconstructionFailed, reconstruct
 from .job_folder import RESULT
 
 NAME = "fewview"
 EXIT_FINE, EXIT_FAULT, EXIT_USER_ERROR, EXIT_CANCELLED = 0, 1, 2, 130
-_FAULTS = frozenset({CRASHED, "internal", "protocol_broken", "result_refused"})
+_FAULTS = frozenset({CRASHED, PROTOCOL_BROKEN, "internal", "result_refused"})
+_EXCEPTION = "Error: Python: "
+"""How the error of an operator begins that did not expect it."""
 
 
 def main(words: Sequence[str]) -> int:
@@ -31,11 +33,14 @@ def main(words: Sequence[str]) -> int:
         asked = parser.parse_args(list(words))
     except SystemExit as ending:  # argparse has said why
         return int(ending.code or 0)
+    jobs.forget()
     try:
         summary = asked.run(asked)
     except ReconstructionFailed as error:
         return _failed(str(error), _exit_code(error.failure.code))
-    except (ValueError, RuntimeError, OSError) as error:
+    except RuntimeError as error:  # what an operator reports, or a job that cannot be started
+        return _failed(str(error).removeprefix("Error: ").rstrip(), _exit_code_of_operator(str(error)))
+    except (ValueError, OSError) as error:
         return _failed(str(error), EXIT_USER_ERROR)
     sys.stdout.write(json.dumps(summary) + "\n")
     sys.stdout.flush()
@@ -122,6 +127,14 @@ def _exit_code(code: str) -> int:
     if code == CANCELLED:
         return EXIT_CANCELLED
     return EXIT_FAULT if code in _FAULTS else EXIT_USER_ERROR
+
+
+def _exit_code_of_operator(text: str) -> int:
+    """An operator's error has no code, but the job that it waited for has."""
+    if text.startswith(_EXCEPTION):
+        return EXIT_FAULT
+    end = jobs.ended()
+    return EXIT_USER_ERROR if end is None or end.failure is None else _exit_code(end.failure.code)
 
 
 def _failed(text: str, exit_code: int) -> int:

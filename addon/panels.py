@@ -6,6 +6,7 @@ from pathlib import Path
 import bpy
 
 from . import jobs
+from .camera_objects import JOB
 from .colours import legend
 from .environment import State
 from .error_map import numbers_of
@@ -15,6 +16,7 @@ from .operators.images import list_problems
 from .operators.reconstruct import jobs_parent
 from .progress import seconds_left, stage_words, time_words
 from .properties import settings_of
+from .result_mesh import result_or_none
 from .result_numbers import result_lines
 from .state_lines import (
     READY,
@@ -22,6 +24,7 @@ from .state_lines import (
     StepState,
     cameras_state,
     images_state,
+    in_scene,
     reconstruct_state,
     region_state,
     result_state,
@@ -158,15 +161,16 @@ class FEWVIEW_PT_region(_Step, bpy.types.Panel):
         """A sphere, or nothing."""
         layout, settings = self.layout, settings_of(context)
         _draw_state(layout, self.state(context))
-        if settings.region is None:
+        region = in_scene(settings, settings.region)
+        if region is None:
             layout.operator("fewview.add_region", icon="SPHERE")
             _draw_text(layout, context, "Not needed: a sphere in the scene that you move and scale")
             return
         row = layout.row(align=True)
         row.operator("fewview.fit_region", icon="FULLSCREEN_EXIT", text="Fit to Subject")
         row.operator("fewview.remove_region", icon="X", text="")
-        layout.prop(settings.region, "location")
-        layout.prop(settings.region, "scale")
+        layout.prop(region, "location")
+        layout.prop(region, "scale")
 
 
 class FEWVIEW_PT_reconstruct(_Step, bpy.types.Panel):
@@ -182,13 +186,12 @@ class FEWVIEW_PT_reconstruct(_Step, bpy.types.Panel):
     def draw(self, context: bpy.types.Context) -> None:
         """Preset and start."""
         layout, settings = self.layout, settings_of(context)
+        _draw_state(layout, self.state(context))
         layout.row().prop(settings, "preset", expand=True)
-        ready = reconstruct_state(settings).icon != TODO
+        ready = self.state(context).icon != TODO
         row = layout.row()
         row.enabled = ready
         _button(row, "fewview.reconstruct", icon="MOD_REMESH", text="Reconstruct", main=ready)
-        if not ready:
-            _draw_text(layout, context, "Add photographs in step 1 first")
 
 
 class FEWVIEW_PT_advanced(_Panel, bpy.types.Panel):
@@ -218,15 +221,16 @@ class FEWVIEW_PT_result(_Step, bpy.types.Panel):
 
     def state(self, context: bpy.types.Context) -> StepState:
         """How the step stands."""
-        return result_state(settings_of(context))
+        return result_state(result_or_none(context))
 
     def draw(self, context: bpy.types.Context) -> None:
         """The mesh, how far to trust it, and what to do with it."""
         layout, settings = self.layout, settings_of(context)
         _draw_state(layout, self.state(context))
-        if settings.result is None:
+        result = result_or_none(context)
+        if result is None:
             return
-        folder = settings.result.get("fewview_job", "")
+        folder = str(result.get(JOB, ""))
         for line in result_lines(Path(folder)) if folder else ():
             layout.label(text=line)
         layout.label(text="Show on the mesh:")
@@ -234,12 +238,13 @@ class FEWVIEW_PT_result(_Step, bpy.types.Panel):
         row.operator("fewview.show_colour")
         row.operator("fewview.show_support")
         row.operator("fewview.show_error")
-        _draw_text(layout, context, legend(settings.result.data))
-        if settings.target is not None:
+        _draw_text(layout, context, legend(result.data))
+        target = in_scene(settings, settings.target)
+        if target is not None:
             row = layout.row(align=True)
             row.operator("fewview.measure_error", icon="DRIVER_DISTANCE")
-            row.prop(settings.target, "hide_viewport", text="", emboss=True)
-            numbers = numbers_of(settings.result)
+            row.prop(target, "hide_viewport", text="", emboss=True)
+            numbers = numbers_of(result)
             if numbers is not None:
                 _draw_text(layout, context, numbers.text)
         column = layout.column(align=True)
@@ -418,13 +423,13 @@ def _draw_state(layout: bpy.types.UILayout, state: StepState) -> None:
 def _draw_text(
     layout: bpy.types.UILayout, context: bpy.types.Context, text: str, *, icon: str = "NONE"
 ) -> None:
-    """A sentence in as many lines as the sidebar is narrow."""
+    """A sentence in as many lines as the sidebar is narrow; nothing for an empty one."""
     scale = context.preferences.system.ui_scale
     width = context.region.width if context.region is not None else 300
     letters = max(int(width / (_PIXELS_PER_LETTER * scale)) - (8 if icon != "NONE" else 5), 16)
     column = layout.column(align=True)
     column.scale_y = 0.8
-    for number, line in enumerate(textwrap.wrap(text, letters) or [""]):
+    for number, line in enumerate(textwrap.wrap(text, letters)):
         column.label(text=line, icon=icon if number == 0 else ("BLANK1" if icon != "NONE" else "NONE"))
 
 

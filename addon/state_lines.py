@@ -52,7 +52,7 @@ def cameras_state(settings: FEWVIEW_PG_settings) -> StepState:
 
 def region_state(settings: FEWVIEW_PG_settings) -> StepState:
     """Step 3."""
-    if settings.region is None:
+    if in_scene(settings, settings.region) is None:
         return StepState(icon=AUTOMATIC, text="Found automatically")
     return StepState(icon=READY, text="Set by the sphere in the scene")
 
@@ -60,17 +60,22 @@ def region_state(settings: FEWVIEW_PG_settings) -> StepState:
 def reconstruct_state(settings: FEWVIEW_PG_settings) -> StepState:
     """Step 4."""
     if sum(image.use for image in settings.images) < FEWEST_IMAGES:
-        return StepState(icon=TODO, text="Photographs are needed first")
-    if settings.result is None:
+        return StepState(icon=TODO, text="Add photographs in step 1 first")
+    if in_scene(settings, settings.result) is None:
         return StepState(icon="PLAY", text="Ready to start")
     return StepState(icon=READY, text="Done; start again as you like")
 
 
-def result_state(settings: FEWVIEW_PG_settings) -> StepState:
-    """Step 5."""
-    if settings.result is None:
+def result_state(result: bpy.types.Object | None) -> StepState:
+    """Step 5, for the result that is meant."""
+    if result is None:
         return StepState(icon=TODO, text="No mesh yet")
-    return StepState(icon=READY, text=settings.result.name)
+    return StepState(icon=READY, text=result.name)
+
+
+def in_scene(settings: FEWVIEW_PG_settings, made: bpy.types.Object | None) -> bpy.types.Object | None:
+    """The object of a setting; None where it was deleted: the setting keeps it alive, out of the scene."""
+    return made if made is not None and settings.id_data.objects.get(made.name) == made else None
 
 
 def solved_or_none(settings: FEWVIEW_PG_settings) -> SolvedScene | None:

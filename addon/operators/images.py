@@ -1,6 +1,8 @@
 """Step 1: the list of photographs."""
 
 from collections.abc import Iterable
+from errno import ENOENT
+from os import strerror
 from pathlib import Path
 
 import bpy
@@ -90,6 +92,9 @@ class FEWVIEW_OT_add_images(bpy.types.Operator):
         """Add what was chosen."""
         try:
             paths = self._paths()
+        except FileNotFoundError as error:
+            self.report({"ERROR"}, f"{error.filename} is not there: choose another file or folder")
+            return {"CANCELLED"}
         except OSError as error:
             self.report({"ERROR"}, f"The folder cannot be read: {error.strerror or error}")
             return {"CANCELLED"}
@@ -99,10 +104,15 @@ class FEWVIEW_OT_add_images(bpy.types.Operator):
         settings = settings_of(context)
         num_new = add_images(settings, paths)
         settings.source = "FILES"
+        if len(settings.images) >= MOST_IMAGES:
+            self.report({"WARNING"}, f"The list is full: it takes {MOST_IMAGES} photographs")
         self.report({"INFO"}, f"{num_new} photographs added")
         return {"FINISHED"}
 
     def _paths(self) -> list[Path]:
+        """The image files that are meant. Raises OSError where one, or the folder, cannot be read."""
+        if not self.directory and not self.filepath:
+            return []  # not the folder that Blender was started in
         folder = Path(bpy.path.abspath(self.directory)) if self.directory else None
         names = [file.name for file in self.files if file.name]
         if folder is not None and names:
@@ -113,6 +123,8 @@ class FEWVIEW_OT_add_images(bpy.types.Operator):
             chosen = [folder or Path(bpy.path.abspath(self.filepath))]
         found: list[Path] = []
         for path in chosen:
+            if not path.exists():
+                raise FileNotFoundError(ENOENT, strerror(ENOENT), str(path))
             found += images_in(path) if path.is_dir() else [path]
         return [path.absolute() for path in found if path.suffix.lower() in EXTENSIONS]
 
@@ -138,7 +150,7 @@ class FEWVIEW_OT_remove_image(_OnList, bpy.types.Operator):
     def execute(self, context: bpy.types.Context) -> set[str]:
         """Remove one."""
         settings = settings_of(context)
-        settings.images.remove(settings.active_image)
+        settings.images.remove(min(max(settings.active_image, 0), len(settings.images) - 1))
         settings.active_image = max(min(settings.active_image, len(settings.images) - 1), 0)
         return {"FINISHED"}
 

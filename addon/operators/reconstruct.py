@@ -23,6 +23,9 @@ from ..state_lines import FEWEST_IMAGES
 from .environment import backend_python_or_reason
 from .images import used_images
 
+_LOG_TEXT = "fewview_log"
+"""Custom property of the text block with the log."""
+
 
 def jobs_parent(context: bpy.types.Context, given: str = "") -> Path:
     """Folder in which jobs get folders of their own.
@@ -154,10 +157,11 @@ def start(python: Path, folder: Path, asked: Job, *, scene_name: str) -> None:
     Raises JobError where it cannot be started.
     """
     path = write_job(folder, asked)
-
     job = PastJob(folder=folder, job=asked)
+    uid = scene_named(scene_name).session_uid
 
     def on_preview(shown: Path) -> jobs.Steps:
+        scene_name = _scene_name(uid)
         if shown.suffix == ".json":
             yield from show_estimated_cameras(shown, job, scene_name)
             return
@@ -167,7 +171,7 @@ def start(python: Path, folder: Path, asked: Job, *, scene_name: str) -> None:
             yield from show_preview(shown, wanted)
 
     def on_finished(_: Finished) -> jobs.Steps:
-        yield from import_result_steps(folder, scene_name=scene_name, undo=not bpy.app.background)
+        yield from import_result_steps(folder, scene_name=_scene_name(uid), undo=not bpy.app.background)
 
     jobs.start(
         "Reconstructing",
@@ -178,6 +182,14 @@ def start(python: Path, folder: Path, asked: Job, *, scene_name: str) -> None:
         on_preview=on_preview,
         on_end=remove_preview,
     )
+
+
+def _scene_name(uid: int) -> str:
+    """What the scene is called by now. Raises ValueError where it was removed."""
+    found = next((scene for scene in bpy.data.scenes if scene.session_uid == uid), None)
+    if found is None:
+        raise ValueError("the scene that the job was started in is no longer there")
+    return str(found.name)
 
 
 def _absolute(path: str) -> str:
@@ -211,6 +223,7 @@ class FEWVIEW_OT_show_log(bpy.types.Operator):
 
     bl_idname = "fewview.show_log"
     bl_label = "Show Log"
+    bl_options = {"REGISTER", "UNDO"}
 
     @classmethod
     def poll(cls, _context: bpy.types.Context) -> bool:
@@ -222,7 +235,10 @@ class FEWVIEW_OT_show_log(bpy.types.Operator):
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         """Put the log into a text block, and into a window of its own where there is one."""
-        text = bpy.data.texts.get("FewView Log") or bpy.data.texts.new("FewView Log")
+        text = next((made for made in bpy.data.texts if _LOG_TEXT in made), None)
+        if text is None:  # by its mark: a text of that name may be the user's
+            text = bpy.data.texts.new("FewView Log")
+            text[_LOG_TEXT] = True
         text.from_string(report_text(context))
         if not bpy.app.background:
             bpy.ops.wm.window_new()

@@ -2,7 +2,6 @@
 
 import importlib
 import os
-import subprocess
 import sys
 import tempfile
 from collections.abc import Iterator
@@ -11,7 +10,7 @@ from types import ModuleType
 
 import pytest
 
-ROOT = Path(__file__).resolve().parents[2]
+sys.path.insert(0, str(Path(__file__).parent))  # for build_extension
 EXTENSION = "bl_ext.user_default.fewview"
 
 # The tests must neither see nor change the settings of the person who runs them. Blender reads this when it
@@ -26,13 +25,10 @@ elif "BLENDER_USER_RESOURCES" not in os.environ:
 @pytest.fixture(scope="session")
 def extension_zip(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The extension, built by Blender's own tool."""
-    bpy = pytest.importorskip("bpy", reason="needs Blender's Python, where `import bpy` works")
-    folder = tmp_path_factory.mktemp("zip")
-    tool = Path(bpy.utils.system_resource("SCRIPTS")) / "addons_core/bl_pkg/cli/blender_ext.py"
-    command = [sys.executable, str(tool), "build", "--source-dir", str(ROOT), "--output-dir", str(folder)]
-    subprocess.run(command, check=True, capture_output=True, timeout=60)
-    (found,) = folder.glob("*.zip")
-    return found
+    pytest.importorskip("bpy", reason="needs Blender's Python, where `import bpy` works")
+    from build_extension import build_extension
+
+    return build_extension(tmp_path_factory.mktemp("zip"))
 
 
 @pytest.fixture(scope="session")

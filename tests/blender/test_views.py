@@ -206,7 +206,8 @@ def test_the_floor_still_lights_the_subject(cube: Any, tmp_path: Path) -> None:
     """A glowing floor that is not in the mask is seen in the colour of the cube."""
     bpy.data.objects["Sun"].hide_render = True
     glow = bpy.data.materials.new("glow")
-    glow.use_nodes = True
+    if glow.node_tree is None:  # before Blender 5.0 a new material has no nodes
+        glow.use_nodes = True
     shader = next(node for node in glow.node_tree.nodes if node.type == "BSDF_PRINCIPLED")
     shader.inputs["Emission Color"].default_value = (1.0, 0.0, 0.0, 1.0)
     shader.inputs["Emission Strength"].default_value = 5.0
@@ -555,7 +556,8 @@ def painted(cube: Any, tmp_path: Path) -> Any:
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "own/work.blend"))
     cube = bpy.data.objects["Cube"]
     glow = bpy.data.materials.new("glow")
-    glow.use_nodes = True
+    if glow.node_tree is None:  # before Blender 5.0 a new material has no nodes
+        glow.use_nodes = True
     tree = glow.node_tree
     texture, emission = tree.nodes.new("ShaderNodeTexImage"), tree.nodes.new("ShaderNodeEmission")
     texture.image = bpy.data.images.load("//textures/green.png")
