@@ -401,7 +401,7 @@ def expected_colours(
 WORKBENCH = pytest.param(
     "BLENDER_WORKBENCH",
     marks=pytest.mark.skipif(
-        not bpy.app.module and sys.platform.startswith("linux") and "DISPLAY" not in os.environ,
+        bool(bpy.app.binary_path) and sys.platform.startswith("linux") and "DISPLAY" not in os.environ,
         reason="Blender as a program draws Workbench on a display, and dies where there is none",
     ),
 )
