@@ -8,6 +8,7 @@ Exit codes: 0 fine, 1 a fault of the program, 2 something the user can mend, 130
 
 import argparse
 import json
+import signal
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -34,8 +35,11 @@ def main(words: Sequence[str]) -> int:
     except SystemExit as ending:  # argparse has said why
         return int(ending.code or 0)
     jobs.forget()
+    _take_over_ctrl_c()
     try:
         summary = asked.run(asked)
+    except KeyboardInterrupt:
+        return _failed("Stopped", EXIT_CANCELLED)
     except ReconstructionFailed as error:
         return _failed(str(error), _exit_code(error.failure.code))
     except RuntimeError as error:  # what an operator reports, or a job that cannot be started
@@ -45,6 +49,12 @@ def main(words: Sequence[str]) -> int:
     sys.stdout.write(json.dumps(summary) + "\n")
     sys.stdout.flush()
     return EXIT_FINE
+
+
+def _take_over_ctrl_c() -> None:
+    """Blender starts commands with a handler of its own, which Python can neither call nor put back."""
+    if signal.getsignal(signal.SIGINT) is None:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def _reconstruct(asked: argparse.Namespace) -> dict[str, object]:
@@ -132,7 +142,7 @@ def _exit_code(code: str) -> int:
 def _exit_code_of_operator(text: str) -> int:
     """An operator's error has no code, but the job that it waited for has."""
     if text.startswith(_EXCEPTION):
-        return EXIT_FAULT
+        return EXIT_CANCELLED if "\nKeyboardInterrupt" in text else EXIT_FAULT
     end = jobs.ended()
     return EXIT_USER_ERROR if end is None or end.failure is None else _exit_code(end.failure.code)
 

@@ -7,13 +7,16 @@ import bpy
 import numpy as np
 from numpy.typing import NDArray
 
-from . import undo_step
-from .camera_objects import CameraImport, import_steps, read_import, root_or_none
+from . import camera_lens, undo_step
+from .camera_objects import ROLE, CameraImport, import_steps, read_import, root_or_none
 from .frames import frame_owner, has_own_frame, world_from_solved_or_none
 from .job_folder import CAMERAS, MESH, PastJob, inside, read_job
 from .mesh_import import MeshImport, import_mesh, read_in_steps, scene_named
 from .placing import upright_from_solved
 from .solved import SolvedScene, read_solved
+
+_SAME_PLACE = 1e-4
+"""Of a camera's axes, and of its place in what all cameras span."""
 
 
 def import_result_steps(
@@ -21,17 +24,24 @@ def import_result_steps(
 ) -> Iterator[None]:
     """Import the mesh of a job, and its cameras, in steps short enough for a timer, as one undo step.
 
-    The cameras of an earlier job that this one was given are left as they are. Give `undo` False where an
-    operator makes the undo step itself. The mesh is read first: where it cannot be used, the scene is left
-    as it is. Raises FolderError, ValueError or OSError with a sentence for the user.
+    The cameras of an earlier job that this one was given are left as they are, and so are cameras of the
+    user's that the views were rendered from. Give `undo` False where an operator makes the undo step
+    itself. The mesh is read first: where it cannot be used, the scene is left as it is. Raises
+    FolderError, ValueError or OSError with a sentence for the user.
     """
     job = read_job(folder)
     mesh = yield from read_in_steps(inside(job.folder, job.result / MESH))
     found = _cameras_or_none(job)
     yield
-    if cameras and found is not None and frame_owner(job) == job.folder:
-        yield from import_steps(scene_name, found)
     scene = scene_named(scene_name)
+    if (
+        cameras
+        and found is not None
+        and frame_owner(job) == job.folder
+        and not _are_there(scene, found.solved)
+    ):
+        yield from import_steps(scene_name, found)
+        scene = scene_named(scene_name)
     root = root_or_none(scene, str(frame_owner(job).absolute()))
     wanted = MeshImport(
         job=str(job.folder.absolute()),
@@ -69,6 +79,18 @@ def world_from_solved(
     if solved is None or solved.region_centre is None or solved.region_radius is None:
         return np.eye(4)
     return upright_from_solved(solved.poses, np.array(solved.region_centre), solved.region_radius)
+
+
+def _are_there(scene: bpy.types.Scene, solved: SolvedScene) -> bool:
+    """Whether the user has a camera wherever a known one stands, as after a render of generated views."""
+    own = [made for made in scene.objects if made.type == "CAMERA" and ROLE not in made]
+    if solved.estimated or not own:
+        return False
+    stand = np.array([camera_lens.world_from_camera(camera) for camera in own])
+    size = float(np.ptp(stand[:, :3, 3], axis=0).max()) or 1.0
+    off = np.abs(stand[None] - solved.poses[:, None])
+    off[..., :3, 3] /= size
+    return bool((off.max(axis=(-2, -1)).min(axis=1) < _SAME_PLACE).all())
 
 
 def _cameras_or_none(job: PastJob) -> CameraImport | None:

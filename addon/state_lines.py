@@ -10,7 +10,7 @@ from .operators.images import list_problems
 from .properties import FEWVIEW_PG_settings
 from .solved import SolvedScene, read_solved
 
-READY, TODO, TROUBLE, AUTOMATIC = "CHECKMARK", "RADIOBUT_OFF", "ERROR", "AUTO"
+READY, TODO, TROUBLE, AUTOMATIC = "CHECKMARK", "RADIOBUT_OFF", "ERROR", "DOT"
 FEWEST_IMAGES = 2
 """Two photographs are reconstructed, though three are better."""
 

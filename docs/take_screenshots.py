@@ -18,6 +18,7 @@ from pathlib import Path
 
 import bpy
 import numpy as np
+from mathutils import Euler
 from numpy.typing import NDArray
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
@@ -27,6 +28,8 @@ from blender_scenes.lighting import light_scene
 from blender_scenes.reconstruct_scene import enable_extension
 from blender_scenes.scenes import SCENES, build_scene
 
+VIEW_ANGLES = (1.25, 0.0, -0.55)
+"""From the front, a little from the left and above."""
 SETTLE_S = 0.7
 """Until what was changed is on the screen; drawing is slow where there is no GPU."""
 
@@ -86,6 +89,8 @@ def subject() -> bpy.types.Object:
     built = build_scene(SCENES["monkey"]("monkey", 0))
     centre, radius = bounding_sphere(true_mesh(built.subjects))
     light_scene(centre=centre, radius=radius)
+    for made in bpy.context.scene.objects:
+        made.hide_set(made.type == "LIGHT")  # it still shines
     bpy.context.view_layer.objects.active = built.subjects[0]
     return built.subjects[0]
 
@@ -107,6 +112,7 @@ def photographed(path: Path, *, whole: bool = False) -> Iterator[float]:
     sidebar = next(region for region in area.regions if region.type == "UI")
     if whole:
         main_region = next(region for region in area.regions if region.type == "WINDOW")
+        area.spaces.active.region_3d.view_rotation = Euler(VIEW_ANGLES).to_quaternion()
         with bpy.context.temp_override(window=window(), area=area, region=main_region):
             bpy.ops.view3d.view_all()
     area.tag_redraw()
@@ -167,7 +173,9 @@ def until_idle() -> Iterator[float]:
     while jobs.running() is not None:
         yield 0.2
     end = jobs.ended()
-    sys.stderr.write(f"{end.title}: {'fine' if end.failure is None else end.failure.text}\n")
+    how = "fine" if end.failure is None else end.failure.text
+    longest_ms = 1000 * jobs.longest_tick_s
+    sys.stderr.write(f"{end.title}: {how}, {end.seconds:.0f} s, longest tick {longest_ms:.1f} ms\n")
     yield SETTLE_S
 
 
@@ -187,6 +195,7 @@ def main(words: list[str]) -> None:
     parser.add_argument("--output", type=Path, required=True)
     output = parser.parse_args(words).output.absolute()
     output.mkdir(parents=True, exist_ok=True)
+    bpy.context.preferences.view.show_splash = False
     steps = tour(output)
 
     def step() -> float | None:

@@ -50,7 +50,8 @@ class FakeLayout:
 
     def __setattr__(self, name: str, value: object) -> None:
         """Only what a layout has, and of the right kind."""
-        assert name in SETTINGS and name in bpy.types.UILayout.bl_rna.properties, f"a layout has no {name}"
+        known = name in SETTINGS and name in bpy.types.UILayout.bl_rna.properties
+        assert known, f"a layout has no {name}"
         wanted = type(SETTINGS[name])
         assert type(value) in ({float, int} if wanted is float else {wanted}), f"{name} = {value!r}"
         object.__setattr__(self, name, value)

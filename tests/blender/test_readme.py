@@ -1,0 +1,252 @@
+"""What the README promises of Blender: its examples run, its commands end as it says, its buttons exist."""
+
+import importlib
+import json
+import os
+import re
+import shlex
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import pytest
+
+bpy = pytest.importorskip("bpy", reason="needs Blender's Python, where `import bpy` works")
+
+pytestmark = pytest.mark.blender
+
+ROOT = Path(__file__).resolve().parents[2]
+README = (ROOT / "README.md").read_text(encoding="utf-8")
+SECTION = README[README.index("## In Blender") : README.index("## How it works")]
+BLOCKS = re.findall(r"^```(\w*)\n(.*?)^```$", SECTION, flags=re.MULTILINE | re.DOTALL)
+PYTHON_EXAMPLES = [text for language, text in BLOCKS if language == "python"]
+COMMANDS = re.findall(r"^blender .*--command fewview (.+)$", SECTION, flags=re.MULTILINE)
+FILES = re.findall(r"\]\(((?!http)[^)#]+)\)", README)
+SMALL = {"resolution_x": 64, "resolution_y": 48, "samples": 1}
+"""For the settings of the scene, from which examples take what they leave out."""
+
+
+@pytest.fixture
+def parts(addon: ModuleType, monkeypatch: pytest.MonkeyPatch) -> Callable[[str], ModuleType]:
+    """The installed add-on's modules by name; this Python is taken for the backend's."""
+
+    def part(name: str) -> ModuleType:
+        return importlib.import_module(f"{addon.__name__}.{name}")
+
+    monkeypatch.setenv("FEWVIEW_PYTHON", sys.executable)
+    monkeypatch.setattr(part("environment"), "_known", {})
+    monkeypatch.setattr(part("environment"), "_ready_text", lambda _: "ready to rehearse")
+    return part
+
+
+@pytest.fixture
+def rehearsed(
+    parts: Callable[[str], ModuleType], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> Callable[..., None]:
+    """In place of the backend its rehearsal, in a folder with photographs and a scene with an object.
+
+    Call it with how the rehearsal shall end, unless it shall end well.
+    """
+    command = importlib.import_module(f"{parts('jobs').__package__.rpartition('.')[0]}.backend.wire.client")
+
+    def rehearse(end: str = "finished") -> None:
+        def rehearsal(python: Path, _: str, job: str) -> tuple[str, ...]:
+            output = ("--output", str(Path(job).parent / "result"))
+            return command.backend_command(python, "rehearse", "--seconds", "0", "--end", end, *output)
+
+        def check(python: Path) -> tuple[str, ...]:
+            return command.backend_command(python, "rehearse", "--seconds", "0", "--end", end)
+
+        monkeypatch.setattr(parts("operators.reconstruct"), "backend_command", rehearsal)
+        monkeypatch.setattr(parts("environment"), "doctor_command", check)
+
+    rehearse()
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "photos").mkdir()
+    for name in ("a.png", "b.png", "c.png"):
+        (tmp_path / "photos" / name).write_bytes(b"")
+    bpy.ops.mesh.primitive_monkey_add()
+    bpy.context.object.name = "Suzanne"
+    for name, value in SMALL.items():
+        setattr(bpy.context.scene.fewview, name, value)
+    return rehearse
+
+
+@pytest.fixture
+def main(parts: Callable[[str], ModuleType]) -> Callable[..., int]:
+    """The command: its words as in a shell, its exit code."""
+    found: Callable[[list[str]], int] = parts("command_line").main
+    return lambda words: found(shlex.split(words))
+
+
+@pytest.mark.parametrize("example", PYTHON_EXAMPLES)
+def test_an_example_runs(example: str, rehearsed: object) -> None:
+    exec(compile(example, "README.md", "exec"), {"__name__": "__main__"})
+    result = bpy.context.scene.fewview.result
+    assert result is not None
+    assert len(result.data.polygons) > 0
+    assert Path(result["fewview_job"]).parent == Path("jobs").absolute()
+
+
+@pytest.mark.parametrize("words", COMMANDS)
+def test_a_command_runs(
+    words: str, rehearsed: object, main: Callable[..., int], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(words) == 0
+    made = json.loads(capsys.readouterr().out.splitlines()[-1])
+    named = [made[key] for key in ("result", "transforms") if key in made] + made.get("images", [])
+    assert all(Path(path).exists() for path in named)
+    if "--save" in words:
+        assert Path("mesh.blend").is_file()
+    if "--views" in words:
+        assert len(made["images"]) == 8
+
+
+def test_there_are_examples_of_every_kind() -> None:
+    assert len(PYTHON_EXAMPLES) == 3
+    assert {words.split()[0] for words in COMMANDS} == {"check", "reconstruct", "render"}
+
+
+def test_what_is_left_out_is_not_the_panels(rehearsed: object, parts: Callable[[str], ModuleType]) -> None:
+    """The function's job is what its arguments say, whatever the scene's settings are."""
+    settings = bpy.context.scene.fewview
+    settings.preset, settings.seed, settings.truth = "detailed", 7, "nowhere.ply"
+    done = parts("api").reconstruct(["photos"], output="jobs")
+    job = json.loads((done.folder / "job.json").read_text(encoding="utf-8"))
+    assert (job["preset"], job["seed"], job["truth"], job["cameras"]) == ("balanced", 0, None, None)
+    assert job["images"] == [str(Path("photos").absolute())]
+    assert done.mesh == settings.result
+    assert done.warnings
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ("reconstruct nowhere --output jobs", "nowhere"),
+        ("reconstruct photos --cameras nowhere.json --output jobs", "nowhere.json"),
+        ("reconstruct photos --seed -1 --output jobs", "seed"),
+        ("reconstruct photos", "--output"),
+        ("reconstruct photos --output jobs --preset best", "best"),
+        ("render --object Nobody --output jobs", "Nobody"),
+        ("render --object Suzanne --output photos/a.png", "a.png"),
+        ("explode", "explode"),
+        ("", "required"),
+    ],
+)
+def test_a_users_mistake_ends_with_2(
+    words: str,
+    said: str,
+    rehearsed: object,
+    main: Callable[..., int],
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert main(words) == 2
+    output = capsys.readouterr()
+    assert said in output.err
+    assert "Error: Error:" not in output.err
+    assert "{" not in output.out
+    assert not Path("jobs").exists()
+
+
+def test_help_is_no_mistake(rehearsed: object, main: Callable[..., int]) -> None:
+    assert main("reconstruct --help") == 0
+
+
+@pytest.mark.parametrize(("end", "code"), [("finished", 0), ("failed", 2), ("crashed", 1)])
+@pytest.mark.parametrize("words", ["reconstruct photos --output jobs", "check"])
+def test_the_exit_code_says_whose_fault_it_is(
+    words: str, end: str, code: int, rehearsed: Callable[..., None], main: Callable[..., int]
+) -> None:
+    rehearsed(end)
+    assert main(words) == code
+
+
+def test_an_earlier_jobs_fault_is_not_held_against_the_next(
+    rehearsed: Callable[..., None], main: Callable[..., int]
+) -> None:
+    rehearsed("crashed")
+    assert main("check") == 1
+    assert main("render --object Suzanne --output photos/a.png") == 2
+
+
+def test_a_stopped_job_ends_with_130(
+    rehearsed: object,
+    main: Callable[..., int],
+    parts: Callable[[str], ModuleType],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    jobs = parts("jobs")
+    start = jobs.start
+
+    def start_and_stop(*positional: Any, **named: Any) -> None:
+        start(*positional, **named)
+        jobs.cancel()
+
+    monkeypatch.setattr(jobs, "start", start_and_stop)
+    assert main("reconstruct photos --output jobs") == 130
+
+
+def test_a_fault_in_an_operator_ends_with_1(
+    rehearsed: object,
+    main: Callable[..., int],
+    parts: Callable[[str], ModuleType],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def generate(*_: object) -> None:
+        raise KeyError("a mistake of ours")
+
+    monkeypatch.setattr(parts("view_cameras"), "generate", generate)
+    assert main("render --object Suzanne --output jobs") == 1
+
+
+def test_a_python_without_the_backend_ends_with_2(
+    parts: Callable[[str], ModuleType], main: Callable[..., int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("FEWVIEW_PYTHON", "/nowhere/python")
+    assert main("check") == 2
+    assert main("reconstruct . --output jobs") == 2
+
+
+def test_buttons_that_are_named_exist() -> None:
+    """Names in italics are those of the interface, as somebody reads them there."""
+    sources = (ROOT / "addon").rglob("*.py")
+    shown = {
+        text for path in sources for text in re.findall(r'"([^"\n]+)"', path.read_text(encoding="utf-8"))
+    }
+    known = {re.sub(r"^\d\. ", "", text) for text in shown} | {"Allow Online Access"}  # Blender's own
+    missing = set(re.findall(r"(?<!\*)\*([A-Z][^*\n]+)\*(?!\*)", SECTION)) - known
+    assert not missing
+
+
+def test_files_that_are_named_exist() -> None:
+    assert [name for name in FILES if not (ROOT / name).exists()] == []
+
+
+@pytest.mark.slow
+@pytest.mark.skipif("FEWVIEW_PYTHON" not in os.environ, reason="FEWVIEW_PYTHON names no backend")
+def test_from_an_object_to_its_mesh_by_commands(
+    addon: ModuleType,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """The real backend, on views so small that only the way is tried, and the mesh is near the object."""
+    from blender_scenes.scenes import SCENES, build_scene
+
+    monkeypatch.chdir(tmp_path)
+    bpy.ops.object.light_add(type="SUN", rotation=(0.9, 0.0, 0.3))
+    (subject,) = build_scene(SCENES["monkey"]("monkey", 0)).subjects
+    main = importlib.import_module(f"{addon.__name__}.command_line").main
+    layout = "--layout arc --views 4 --width 320 --height 240 --samples 4"
+    assert main(["render", "--object", subject.name, *layout.split(), "--output", "jobs"]) == 0
+    made = json.loads(capsys.readouterr().out.splitlines()[-1])
+    known = ["--cameras", made["transforms"], "--preset", "fast"]
+    assert main(["reconstruct", *made["images"], *known, "--output", "jobs", "--save", "mesh.blend"]) == 0
+    assert json.loads(capsys.readouterr().out.splitlines()[-1])["triangles"] > 1000
+    bpy.ops.fewview.measure_error(truth=subject.name)
+    median_percent = bpy.context.scene.fewview.result["fewview_error_percent"][0]
+    assert median_percent < 2.0
+    assert Path("mesh.blend").is_file()
+    assert main(["reconstruct", str(tmp_path / "jobs" / "views-001" / "truth.ply"), "--output", "jobs"]) == 2
