@@ -26,6 +26,7 @@ from .ply import PlyMesh, read_ply
 from .solved import SolvedCamera, SolvedScene, read_solved
 
 JOB, ROLE, PHOTO, SIZE = "fewview_job", "fewview_role", "fewview_photo", "fewview_size"
+UPRIGHT = "fewview_upright"
 """Names of the custom properties."""
 ROOT, CAMERA, POINTS = "root", "camera", "points"
 """Values of `fewview_role`."""
@@ -115,6 +116,17 @@ def root_or_none(scene: bpy.types.Scene, job: str) -> bpy.types.Object | None:
     return next(iter(objects_of(scene, job, ROOT)), None)
 
 
+def world_from_solved(root: bpy.types.Object | None) -> NDArray[np.float64]:
+    """(4, 4) similarity of what hangs on the root; the identity without one.
+
+    The root itself stands upright below the subject, for the user to move, turn and scale: how the solved
+    frame lies in it is kept beside it.
+    """
+    if root is None:
+        return np.eye(4)
+    return np.array(root.matrix_world, np.float64) @ _upright_from_solved(root)
+
+
 def cameras_with_photographs(scene: bpy.types.Scene) -> list[bpy.types.Object]:
     """The cameras that imports have made, by photograph."""
     found = [made for made in scene.objects if made.type == "CAMERA" and made.get(PHOTO)]
@@ -184,9 +196,9 @@ def _make_root(scene: bpy.types.Scene, wanted: CameraImport) -> None:
         root = bpy.data.objects.new("FewView Placement", None)
         _tag(root, wanted.job, ROOT)
         _collection(scene, wanted.job).objects.link(root)
-        root.empty_display_type = "ARROWS"
-        root.empty_display_size = _size_solved(wanted.solved)
-        root.matrix_world = Matrix(_upright(wanted).tolist())
+        root.empty_display_type = "PLAIN_AXES"
+        root.empty_display_size = 0.25
+        root[UPRIGHT] = _upright(wanted).ravel().tolist()
     scene.fewview.root = root
 
 
@@ -217,18 +229,32 @@ def _make_camera(scene: bpy.types.Scene, wanted: CameraImport, solved: SolvedCam
 
 
 def _hang(
-    made: bpy.types.Object, root: bpy.types.Object | None, root_from_object: NDArray[np.float64]
+    made: bpy.types.Object, root: bpy.types.Object | None, solved_from_object: NDArray[np.float64]
 ) -> None:
-    """Put the object where it belongs in the root's frame."""
+    """Put the object where it belongs, under the root; a camera keeps its own size."""
     made.parent = root
+    root_from_object = _upright_from_solved(root) @ solved_from_object
+    if made.type == "CAMERA":
+        root_from_object[:3, :3] /= np.cbrt(np.linalg.det(root_from_object[:3, :3]))
     made.matrix_basis = Matrix(root_from_object.tolist())
 
 
+def _upright_from_solved(root: bpy.types.Object | None) -> NDArray[np.float64]:
+    """(4, 4) similarity that the root keeps; the identity where there is none, or the user has removed it."""
+    kept = None if root is None else root.get(UPRIGHT)
+    if kept is None or len(kept) != 16:
+        return np.eye(4)
+    return np.array(kept, np.float64).reshape(4, 4)
+
+
 def _set_sizes(camera: bpy.types.Object, root: bpy.types.Object | None, solved: SolvedScene) -> None:
-    """Clipping range and size on the screen that fit the subject: they do not follow the root's scale."""
-    scale = 1.0 if root is None else max(abs(value) for value in root.matrix_basis.to_scale())
+    """Clipping range and size on the screen that fit the subject."""
+    scale = float(np.cbrt(abs(np.linalg.det(world_from_solved(root)[:3, :3]))))
     size = _size_solved(solved) * scale
-    distance = scale * float(np.linalg.norm(np.array(camera.matrix_basis.translation) - _centre(solved)))
+    centre = np.append(_centre(solved), 1.0)
+    centre_root = (_upright_from_solved(root) @ centre)[:3]
+    distance = float(np.linalg.norm(np.array(camera.matrix_basis.translation) - centre_root))
+    distance *= 1.0 if root is None else max(map(abs, root.matrix_world.to_scale()))
     camera.data.display_size = 0.3 * size
     camera.data.clip_start = 0.01 * size
     camera.data.clip_end = 2 * distance + 100 * size

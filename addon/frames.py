@@ -10,7 +10,7 @@ import bpy
 import numpy as np
 from numpy.typing import NDArray
 
-from .camera_objects import root_or_none
+from .camera_objects import root_or_none, world_from_solved
 from .job_folder import CAMERAS, JOB_FILE, RESULT, PastJob
 
 
@@ -35,4 +35,4 @@ def world_from_solved_or_none(scene: bpy.types.Scene, job: PastJob) -> NDArray[n
     if not has_own_frame(job) and owner == job.folder:
         return np.eye(4)
     root = root_or_none(scene, str(owner.absolute()))
-    return None if root is None else np.array(root.matrix_world, np.float64)
+    return None if root is None else world_from_solved(root)

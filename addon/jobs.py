@@ -238,11 +238,12 @@ def log_path() -> Path | None:
 
 
 def redraw() -> None:
-    """Have the panels drawn again."""
+    """Have the panels drawn again, and not the scene beside them: that may cost the job its time."""
     for window in bpy.context.window_manager.windows:
         for area in window.screen.areas:
-            if area.type in {"VIEW_3D", "PREFERENCES"}:
-                area.tag_redraw()
+            for region in area.regions:
+                if (area.type, region.type) in {("VIEW_3D", "UI"), ("PREFERENCES", "WINDOW")}:
+                    region.tag_redraw()
 
 
 def _tick() -> float | None:

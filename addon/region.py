@@ -7,7 +7,7 @@ import numpy as np
 from mathutils import Matrix
 from numpy.typing import NDArray
 
-from .camera_objects import JOB, POINTS, ROLE
+from .camera_objects import JOB, POINTS, ROLE, world_from_solved
 from .job_folder import CAMERAS, RESULT, inside
 from .placing import region_in_solved, sphere_around
 from .solved import read_solved
@@ -38,8 +38,7 @@ def region_of(scene: bpy.types.Scene) -> Sphere | None:
 
 def world_from_root(scene: bpy.types.Scene) -> NDArray[np.float64]:
     """(4, 4) similarity `world_from_solved` of the scene; the identity where cameras are known."""
-    root = _of_scene(scene, scene.fewview.root)
-    return np.eye(4) if root is None else np.array(root.matrix_world, np.float64)
+    return world_from_solved(_of_scene(scene, scene.fewview.root))
 
 
 def place_region(scene: bpy.types.Scene, sphere: Sphere) -> bpy.types.Object:

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from . import camera_lens, undo_step
-from .camera_objects import ROLE, CameraImport, import_steps, read_import, root_or_none
+from .camera_objects import POINTS, ROLE, CameraImport, import_steps, objects_of, read_import, root_or_none
 from .frames import frame_owner, has_own_frame, world_from_solved_or_none
 from .job_folder import CAMERAS, MESH, PastJob, inside, read_job
 from .mesh_import import MeshImport, import_mesh, read_in_steps, scene_named
@@ -50,6 +50,7 @@ def import_result_steps(
         parent_uid=None if root is None else root.session_uid,
     )
     yield from import_mesh(mesh, wanted)
+    _settle(scene_named(scene_name), job)
     if undo:
         undo_step.push(f"Import {job.folder.name}")
 
@@ -79,6 +80,14 @@ def world_from_solved(
     if solved is None or solved.region_centre is None or solved.region_radius is None:
         return np.eye(4)
     return upright_from_solved(solved.poses, np.array(solved.region_centre), solved.region_radius)
+
+
+def _settle(scene: bpy.types.Scene, job: PastJob) -> None:
+    """Hide the points, which would cover the mesh; let the next job use the cameras that this one found."""
+    for points in objects_of(scene, str(frame_owner(job).absolute()), POINTS):
+        points.hide_viewport = True
+    if has_own_frame(job):
+        scene.fewview.cameras_job = str(job.folder.absolute())
 
 
 def _are_there(scene: bpy.types.Scene, solved: SolvedScene) -> bool:

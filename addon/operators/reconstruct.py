@@ -41,9 +41,10 @@ def jobs_parent(context: bpy.types.Context, given: str = "") -> Path:
 
 
 def cameras_for(settings: FEWVIEW_PG_settings, images: Sequence[Path]) -> str | None:
-    """The cameras file of the job: given, or found in step 2; None to find them now.
+    """The cameras file of the job: given, or found by an earlier job; None to find them now.
 
-    Raises ValueError where the list has changed since they were found.
+    Raises ValueError where there are new photographs, so that the cameras have to be found again, and a
+    region that says where in the old cameras' frame the subject is.
     """
     if settings.camera_source == "KNOWN":
         if not settings.cameras_path:
@@ -59,7 +60,11 @@ def cameras_for(settings: FEWVIEW_PG_settings, images: Sequence[Path]) -> str | 
     known = {camera.name for camera in solved.cameras} | {name for name, _ in solved.unplaced}
     if {path.name for path in images} <= known:
         return str(path)
-    raise ValueError("Photographs were added since the cameras were estimated: estimate them again in step 2")
+    if settings.region is None:
+        return None
+    raise ValueError(
+        "The region belongs to cameras without the new photographs: estimate them again in step 2"
+    )
 
 
 class FEWVIEW_OT_reconstruct(bpy.types.Operator):

@@ -1,4 +1,4 @@
-"""Builds the extension's zip with Blender's own tool: python tests/blender/build_extension.py --output DIR."""
+"""Builds the zip with Blender's own tool: python tests/blender/build_extension.py --output DIR."""
 
 import argparse
 import subprocess

@@ -207,14 +207,18 @@ def test_estimated_cameras_hang_on_a_root_that_places_them_upright(part: Any, jo
     import_cameras(job)
     (root,) = by_role("root")
     assert bpy.context.scene.fewview.root == root
-    world_from_solved = np.array(root.matrix_world)
+    np.testing.assert_array_equal(np.array(root.matrix_world), np.eye(4))  # for the user to move
+    world_from_solved = part("camera_objects").world_from_solved(root)
     for camera, solved in zip(by_role("camera"), looking_at_origin(part), strict=True):
-        np.testing.assert_allclose(np.array(camera.matrix_world), world_from_solved @ solved, atol=1e-5)
+        expected = world_from_solved @ solved
+        expected[:3, :3] /= 2  # a camera keeps its own size
+        np.testing.assert_allclose(np.array(camera.matrix_world), expected, atol=1e-5)
         found = part("camera_lens").world_from_camera(camera)
         np.testing.assert_allclose(found[:3, 3], (world_from_solved @ solved)[:3, 3], atol=1e-5)
     (points,) = by_role("points")
     np.testing.assert_allclose(np.array(points.matrix_world), world_from_solved, atol=1e-6)
-    assert root.scale.x == pytest.approx(2.0)  # the region's radius of 0.5 becomes 1 m
+    scale = np.cbrt(np.linalg.det(world_from_solved[:3, :3]))
+    assert scale == pytest.approx(2.0)  # the region's radius of 0.5 becomes 1 m
 
 
 def test_the_scenes_frame_is_the_photographs(part: Any, job: Path) -> None:
@@ -283,7 +287,8 @@ def test_importing_again_replaces_in_place(part: Any, job: Path) -> None:
     import_cameras(job)
     assert {made.name for made in scene.objects} == first
     assert root.location.x == 7  # as the user put it
-    expected = np.array(root.matrix_world) @ looking_at_origin(part)[0]
+    expected = part("camera_objects").world_from_solved(root) @ looking_at_origin(part)[0]
+    expected[:3, :3] /= np.cbrt(np.linalg.det(expected[:3, :3]))
     np.testing.assert_allclose(np.array(by_role("camera")[0].matrix_world), expected, atol=1e-5)
     make_job(part, job, estimated=True, names=("a.png", "b.png"))
     import_cameras(job)

@@ -33,6 +33,11 @@ class Sidebar:
         return importlib.import_module(f"{self.addon.__name__}.{name}")
 
     @property
+    def automatic(self) -> str:
+        """Icon of a step that needs nothing of the user."""
+        return str(self.part("state_lines").AUTOMATIC)
+
+    @property
     def settings(self) -> Any:
         return bpy.context.scene.fewview
 
@@ -387,7 +392,7 @@ def test_samples_belong_to_cycles(sidebar: Sidebar, engine: str) -> None:
 
 def test_cameras_are_estimated_unless_they_are_known(sidebar: Sidebar) -> None:
     layout = sidebar.draw_all()["FEWVIEW_PT_cameras"]
-    assert sidebar.line("cameras") == ("AUTO", "Estimated when you reconstruct")
+    assert sidebar.line("cameras") == (sidebar.automatic, "Estimated when you reconstruct")
     assert layout.operators()["fewview.estimate_cameras"].text == "Estimate Cameras"
     sidebar.settings.camera_source = "KNOWN"
     assert sidebar.line("cameras") == ("RADIOBUT_OFF", "No file chosen")
@@ -422,11 +427,11 @@ def test_damaged_cameras_are_as_none(sidebar: Sidebar, content: bytes | None) ->
     else:
         path.write_bytes(content)
     sidebar.draw_all()
-    assert sidebar.line("cameras") == ("AUTO", "Estimated when you reconstruct")
+    assert sidebar.line("cameras") == (sidebar.automatic, "Estimated when you reconstruct")
 
 
 def test_a_region_and_one_that_was_deleted(sidebar: Sidebar) -> None:
-    assert sidebar.line("region") == ("AUTO", "Found automatically")
+    assert sidebar.line("region") == (sidebar.automatic, "Found automatically")
     assert bpy.ops.fewview.add_region() == {"FINISHED"}
     layout = sidebar.draw_all()["FEWVIEW_PT_region"]
     assert sidebar.line("region") == ("CHECKMARK", "Set by the sphere in the scene")
@@ -434,7 +439,7 @@ def test_a_region_and_one_that_was_deleted(sidebar: Sidebar) -> None:
     delete(sidebar.settings.region)
     assert sidebar.settings.region is not None  # the pointer keeps it
     layout = sidebar.draw_all()["FEWVIEW_PT_region"]
-    assert sidebar.line("region") == ("AUTO", "Found automatically")
+    assert sidebar.line("region") == (sidebar.automatic, "Found automatically")
     assert set(layout.operators()) == {"fewview.add_region"}
     assert bpy.ops.fewview.add_region() == {"FINISHED"}
     assert sidebar.line("region")[0] == "CHECKMARK"
