@@ -35,7 +35,6 @@ def main(words: Sequence[str]) -> int:
     except SystemExit as ending:  # argparse has said why
         return int(ending.code or 0)
     jobs.forget()
-    _take_over_ctrl_c()
     try:
         summary = asked.run(asked)
     except KeyboardInterrupt:
@@ -52,12 +51,16 @@ def main(words: Sequence[str]) -> int:
 
 
 def _take_over_ctrl_c() -> None:
-    """Blender starts commands with a handler of its own, which Python can neither call nor put back."""
+    """For waiting for a job: `jobs.wait` puts the handler back, and Blender's own is not one of Python's.
+
+    Not for rendering, which only Blender's own can stop.
+    """
     if signal.getsignal(signal.SIGINT) is None:
         signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def _reconstruct(asked: argparse.Namespace) -> dict[str, object]:
+    _take_over_ctrl_c()
     done = reconstruct(
         asked.images,
         output=asked.output,
@@ -94,6 +97,7 @@ def _render(asked: argparse.Namespace) -> dict[str, object]:
 
 
 def _check(_asked: argparse.Namespace) -> dict[str, object]:
+    _take_over_ctrl_c()
     bpy.ops.fewview.check_backend()
     end = jobs.ended()
     assert end is not None
@@ -142,7 +146,7 @@ def _exit_code(code: str) -> int:
 def _exit_code_of_operator(text: str) -> int:
     """An operator's error has no code, but the job that it waited for has."""
     if text.startswith(_EXCEPTION):
-        return EXIT_CANCELLED if "\nKeyboardInterrupt" in text else EXIT_FAULT
+        return EXIT_FAULT
     end = jobs.ended()
     return EXIT_USER_ERROR if end is None or end.failure is None else _exit_code(end.failure.code)
 

@@ -200,7 +200,8 @@ def wait() -> EndedJob:
             _advance(None)
             time.sleep(0.02)
     finally:
-        signal.signal(signal.SIGINT, before)
+        # None: somebody outside of Python, such as Blender's command line, had set one.
+        signal.signal(signal.SIGINT, signal.SIG_DFL if before is None else before)
     assert _ended is not None
     return _ended
 

@@ -289,17 +289,21 @@ def test_chosen_files_come_in_the_order_that_was_given(settings: Any, tmp_path: 
 
 @pytest.mark.parametrize("argument", ["directory", "filepath"])
 def test_a_folder_gives_its_images_by_name(settings: Any, tmp_path: Path, argument: str) -> None:
-    add_pictures(tmp_path, "b.png", "a.PNG")
+    names = [f"{letter}.png" for letter in "hcfbgdea"]
+    add_pictures(tmp_path, *names)
     (tmp_path / "notes.txt").write_text("no picture")
     (tmp_path / "folder.png").mkdir()
     assert bpy.ops.fewview.add_images(**{argument: str(tmp_path)}) == {"FINISHED"}
-    assert names_in(settings) == ["a.PNG", "b.png"]
+    assert names_in(settings) == sorted(names)
 
 
 def test_one_file(settings: Any, tmp_path: Path) -> None:
-    add_pictures(tmp_path, "a.png", "b.png")
+    add_pictures(tmp_path, "a.PNG", "b.png", "c.png")
     assert bpy.ops.fewview.add_images(filepath=str(tmp_path / "b.png")) == {"FINISHED"}
     assert names_in(settings) == ["b.png"]
+    # The file browser says both.
+    assert bpy.ops.fewview.add_images(directory=str(tmp_path), filepath=str(tmp_path / "a.PNG"))
+    assert names_in(settings) == ["b.png", "a.PNG"]
 
 
 def test_the_same_again_changes_nothing(settings: Any, tmp_path: Path) -> None:

@@ -5,6 +5,7 @@ import json
 import os
 import re
 import shlex
+import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -207,6 +208,24 @@ def test_a_python_without_the_backend_ends_with_2(
     monkeypatch.setenv("FEWVIEW_PYTHON", "/nowhere/python")
     assert main("check") == 2
     assert main("reconstruct . --output jobs") == 2
+
+
+@pytest.mark.skipif(not bpy.app.binary_path, reason="bpy as a module is no program that can be started")
+@pytest.mark.skipif("FEWVIEW_PYTHON" not in os.environ, reason="FEWVIEW_PYTHON names no backend")
+def test_blender_knows_the_command(extension: str, tmp_path: Path) -> None:
+    """As a shell starts it: there Ctrl-C is not Python's, and the exit code is the program's."""
+
+    def ended(*words: str) -> subprocess.CompletedProcess[str]:
+        command = [bpy.app.binary_path, "--factory-startup", "--addons", extension, "--command", "fewview"]
+        return subprocess.run([*command, *words], capture_output=True, text=True, cwd=tmp_path, timeout=120)
+
+    checked = ended("check")
+    assert checked.returncode == 0, checked.stderr
+    assert "torch" in json.loads(checked.stdout.splitlines()[-1])
+    (tmp_path / "a.png").write_bytes(b"no picture")
+    refused = ended("reconstruct", "a.png", "--output", "jobs")
+    assert refused.returncode == 2, refused.stderr
+    assert "Traceback" not in refused.stderr
 
 
 def test_buttons_that_are_named_exist() -> None:

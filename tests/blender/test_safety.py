@@ -285,6 +285,9 @@ def test_the_preview_is_taken_away(rehearsal: Rehearsal, how: str) -> None:
             preview.hide_set(True)
         case "emptied":
             bpy.data.meshes.remove(preview.data)  # takes the object with it
+    rehearsal.tick_until(lambda: rehearsal.jobs.running().stage == "mesh")
+    (shown,) = [made for made in bpy.context.scene.objects if made.get(ROLE) == "preview"]
+    assert len(shown.data.polygons) == 4  # the next one came
     assert rehearsal.to_end().failure is None
     assert_one_result(folder)
 
