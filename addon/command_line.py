@@ -8,7 +8,6 @@ Exit codes: 0 fine, 1 a fault of the program, 2 something the user can mend, 130
 
 import argparse
 import json
-import signal
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -50,17 +49,7 @@ def main(words: Sequence[str]) -> int:
     return EXIT_FINE
 
 
-def _take_over_ctrl_c() -> None:
-    """For waiting for a job: `jobs.wait` puts the handler back, and Blender's own is not one of Python's.
-
-    Not for rendering, which only Blender's own can stop.
-    """
-    if signal.getsignal(signal.SIGINT) is None:
-        signal.signal(signal.SIGINT, signal.default_int_handler)
-
-
 def _reconstruct(asked: argparse.Namespace) -> dict[str, object]:
-    _take_over_ctrl_c()
     done = reconstruct(
         asked.images,
         output=asked.output,
@@ -97,7 +86,6 @@ def _render(asked: argparse.Namespace) -> dict[str, object]:
 
 
 def _check(_asked: argparse.Namespace) -> dict[str, object]:
-    _take_over_ctrl_c()
     bpy.ops.fewview.check_backend()
     end = jobs.ended()
     assert end is not None

@@ -3,7 +3,6 @@
 import atexit
 import importlib
 import json
-import os
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -328,14 +327,6 @@ def test_working_in_edit_mode_while_it_runs(rehearsal: Rehearsal) -> None:
     assert bpy.context.view_layer.objects.active == mine
     bpy.ops.object.mode_set(mode="OBJECT")
     assert_one_result(folder)
-
-
-def is_alive(pid: int) -> bool:
-    try:
-        os.kill(pid, 0)
-    except ProcessLookupError:
-        return False
-    return True
 
 
 def test_switching_the_add_on_off_while_it_runs(rehearsal: Rehearsal) -> None:
