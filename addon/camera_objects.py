@@ -92,8 +92,11 @@ def problems(wanted: CameraImport) -> tuple[str, ...]:
 def photograph_or_none(name: str, photographs: Sequence[Path]) -> Path | None:
     """The file of a photograph by the name that the backend gives it: the file's, or with its folder."""
     last = Path(name).name
-    files = [path / last if path.is_dir() else path for path in photographs]
-    alike = [path for path in files if path.name == last and path.is_file()]
+    try:
+        files = [path / last if path.is_dir() else path for path in photographs]
+        alike = [path for path in files if path.name == last and path.is_file()]
+    except OSError:  # a name that no file can have
+        return None
     exact = [path for path in alike if path.as_posix().endswith(f"/{name}")]
     found = exact or alike
     return found[0] if len(found) == 1 else None

@@ -6,6 +6,7 @@ import bpy
 from bpy.app.handlers import persistent
 
 from . import jobs
+from .mesh_import import remove_preview
 
 
 @persistent
@@ -14,14 +15,22 @@ def _before_load(*_: object) -> None:
     jobs.detach("Another file was opened meanwhile: find the result with Import Past Job")
 
 
+@persistent
+def _after_load(*_: object) -> None:
+    """A file that was saved while a job ran holds a preview, which nothing would remove any more."""
+    remove_preview()
+
+
 def register() -> None:
     """Watch for files and the end."""
     bpy.app.handlers.load_pre.append(_before_load)
-    atexit.register(jobs.stop)
+    bpy.app.handlers.load_post.append(_after_load)
+    atexit.register(jobs.close)
 
 
 def unregister() -> None:
     """End the running job and watch no more."""
     jobs.stop()
-    atexit.unregister(jobs.stop)
+    atexit.unregister(jobs.close)
+    bpy.app.handlers.load_post.remove(_after_load)
     bpy.app.handlers.load_pre.remove(_before_load)

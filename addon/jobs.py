@@ -214,13 +214,21 @@ def cancel() -> None:
 
 
 def stop() -> None:
-    """End the running job at once: the add-on is switched off, or Blender quits."""
+    """End the running job at once: the add-on is switched off."""
+    job = _running
+    close()
+    if job is not None and job.on_end is not None:
+        job.on_end()
+    if bpy.app.timers.is_registered(_tick):
+        bpy.app.timers.unregister(_tick)
+
+
+def close() -> None:
+    """End the running job's program and touch nothing of Blender, which may be quitting."""
     global _running
     if _running is not None:
         _running.process.close()
         _running = None
-    if bpy.app.timers.is_registered(_tick):
-        bpy.app.timers.unregister(_tick)
 
 
 def detach(reason: str) -> None:
@@ -333,7 +341,7 @@ def _refused(text: str) -> Failed:
     return Failed(
         code=_REFUSED,
         text=f"What came back cannot be used: {text}.",
-        remedy="Install the backend and the add-on from the same version of FewView.",
+        remedy="Find it with Import Past Job, or start again; the log may say more.",
     )
 
 

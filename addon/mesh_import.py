@@ -108,6 +108,14 @@ def scene_named(name: str) -> bpy.types.Scene:
     return found
 
 
+def scene_name_of(uid: int) -> str:
+    """What the scene with this `session_uid` is called by now. Raises ValueError where it was removed."""
+    found = next((scene for scene in bpy.data.scenes if scene.session_uid == uid), None)
+    if found is None:
+        raise ValueError("the scene that the job was started in is no longer there")
+    return str(found.name)
+
+
 def view_layer_of(scene: bpy.types.Scene) -> bpy.types.ViewLayer:
     """The view layer that a window shows of the scene, or else its first."""
     windows = bpy.context.window_manager.windows

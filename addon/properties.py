@@ -122,8 +122,22 @@ class FEWVIEW_PG_settings(bpy.types.PropertyGroup):
         ],
     )
     samples: IntProperty(name="Samples", description="Light paths per pixel in Cycles", default=32, min=1)
-    resolution_x: IntProperty(name="Resolution X", default=800, min=32, max=8192, subtype="PIXEL")
-    resolution_y: IntProperty(name="Y", default=600, min=32, max=8192, subtype="PIXEL")
+    resolution_x: IntProperty(
+        name="Resolution X",
+        description="Width of the pictures",
+        default=800,
+        min=32,
+        max=8192,
+        subtype="PIXEL",
+    )
+    resolution_y: IntProperty(
+        name="Resolution Y",
+        description="Height of the pictures",
+        default=600,
+        min=32,
+        max=8192,
+        subtype="PIXEL",
+    )
 
     # 2. Cameras
     camera_source: EnumProperty(

@@ -26,7 +26,7 @@ def _lines_of(path: Path, _mtime_ns: int) -> tuple[str, ...]:
     """Read once: a panel is drawn many times a second."""
     try:
         report = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+    except (OSError, ValueError, RecursionError):
         return ()
     lines = []
     num_faces = _number(report, "mesh", "num_faces")
@@ -51,6 +51,10 @@ def _number(found: Any, *keys: str) -> float | None:
         if not isinstance(found, dict):
             return None
         found = found.get(key)
-    if isinstance(found, bool) or not isinstance(found, int | float) or not math.isfinite(found):
+    if isinstance(found, bool) or not isinstance(found, int | float):
         return None
-    return float(found)
+    try:
+        number = float(found)
+    except OverflowError:
+        return None
+    return number if math.isfinite(number) else None

@@ -52,7 +52,7 @@ def tour(output: Path) -> Iterator[float]:
     settings.output = tempfile.mkdtemp(prefix="fewview-tour-")
     bpy.ops.fewview.generate_views(target=target.name, arrangement="ARC", view_count=6)
     yield from photographed(output / "panel_render.png")
-    yield from photographed(output / "views.png", whole=True)
+    yield from photographed(output / "views.jpg", whole=True)
     bpy.ops.fewview.render_views(samples=16)
     yield 6.0
     yield from photographed(output / "panel_rendering.png")
@@ -71,12 +71,12 @@ def tour(output: Path) -> Iterator[float]:
     yield from photographed(output / "panel_running.png")
     yield from until_idle()
     yield from photographed(output / "panel_result.png")
-    yield from photographed(output / "result_colour.png", whole=True)
+    yield from photographed(output / "result_colour.jpg", whole=True)
     bpy.ops.fewview.show_support()
-    yield from photographed(output / "result_support.png", whole=True)
+    yield from photographed(output / "result_support.jpg", whole=True)
 
     # Something to fail on.
-    settings.images[0].path = str(output / "not_there.png")
+    settings.images[0].path = str(Path(tempfile.gettempdir()) / "photographs" / "not_there.png")
     bpy.ops.fewview.reconstruct()
     yield from until_idle()
     yield from photographed(output / "panel_failed.png")
@@ -107,19 +107,20 @@ def opened_sidebar() -> Iterator[float]:
 
 
 def photographed(path: Path, *, whole: bool = False) -> Iterator[float]:
-    """Write the sidebar, or the whole viewport, as a PNG."""
+    """Write the sidebar, or the whole viewport with what is selected in its middle."""
     area = view()
     sidebar = next(region for region in area.regions if region.type == "UI")
     if whole:
+        selected = bool(bpy.context.selected_objects)
         main_region = next(region for region in area.regions if region.type == "WINDOW")
         area.spaces.active.region_3d.view_rotation = Euler(VIEW_ANGLES).to_quaternion()
         with bpy.context.temp_override(window=window(), area=area, region=main_region):
-            bpy.ops.view3d.view_all()
+            (bpy.ops.view3d.view_selected if selected else bpy.ops.view3d.view_all)()
     area.tag_redraw()
     yield SETTLE_S
     shown = area if whole else sidebar
     picture = window_picture()[shown.y : shown.y + shown.height, shown.x : shown.x + shown.width]
-    write_png(path, picture if whole else without_empty_rows(picture))
+    write_picture(path, picture if whole else without_empty_rows(picture))
     sys.stderr.write(f"{path}\n")
 
 
@@ -153,12 +154,13 @@ def read_png(path: Path) -> NDArray[np.float32]:
     return pixels.reshape(height, width, 4)
 
 
-def write_png(path: Path, picture: NDArray[np.float32]) -> None:
-    """An 8-bit PNG of (height, width, 4), bottom row first."""
+def write_picture(path: Path, picture: NDArray[np.float32]) -> None:
+    """A PNG, or a JPEG where the name says so, of (height, width, 4), bottom row first."""
     made = bpy.data.images.new("picture", picture.shape[1], picture.shape[0])
     made.pixels.foreach_set(np.ascontiguousarray(picture).ravel())
-    made.filepath_raw, made.file_format = str(path), "PNG"
-    made.save()
+    made.filepath_raw = str(path)
+    made.file_format = "JPEG" if path.suffix == ".jpg" else "PNG"
+    made.save(quality=85)
     bpy.data.images.remove(made)
 
 

@@ -12,6 +12,7 @@ from ...backend.wire.protocol import PROTOCOL_VERSION, Job, ProtocolError, decod
 from .. import camera_objects, jobs, undo_step
 from ..arguments import argument, fill_in
 from ..job_folder import JOB_FILE, LOG, RESULT, FolderError, new_folder, write_job
+from ..mesh_import import scene_name_of
 from ..properties import settings_of
 from .environment import backend_python_or_reason
 from .images import used_images
@@ -66,7 +67,7 @@ class FEWVIEW_OT_estimate_cameras(bpy.types.Operator):
                 backend_command(python, "reconstruct", str(write_job(folder, job))),
                 folder=folder,
                 log_path=folder / LOG,
-                on_finished=partial(_on_finished, context.scene.name, folder),
+                on_finished=partial(_on_finished, context.scene.session_uid, folder),
             )
         except (FolderError, ValueError, OSError, jobs.JobError) as error:
             self.report({"ERROR"}, str(error))
@@ -208,9 +209,9 @@ def show_cameras(scene_name: str, folder: Path, warnings: list[str]) -> Iterator
     warnings += camera_objects.problems(wanted)
 
 
-def _on_finished(scene_name: str, folder: Path, _: object) -> Iterator[None]:
+def _on_finished(scene_uid: int, folder: Path, _: object) -> Iterator[None]:
     warnings: list[str] = []
-    yield from show_cameras(scene_name, folder, warnings)
+    yield from show_cameras(scene_name_of(scene_uid), folder, warnings)
     job = jobs.running()
     if job is not None:
         job.warnings += [text for text in warnings if text not in job.warnings]

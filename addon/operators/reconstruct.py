@@ -12,7 +12,7 @@ from .. import jobs
 from ..arguments import argument, fill_in
 from ..frames import world_from_solved_or_none
 from ..job_folder import CAMERAS, LOG, RESULT, PastJob, new_folder, write_job
-from ..mesh_import import MeshImport, remove_preview, scene_named, show_preview
+from ..mesh_import import MeshImport, remove_preview, scene_name_of, scene_named, show_preview
 from ..preferences import preferences_of
 from ..properties import FEWVIEW_PG_settings, settings_of
 from ..region import region_of
@@ -166,7 +166,7 @@ def start(python: Path, folder: Path, asked: Job, *, scene_name: str) -> None:
     uid = scene_named(scene_name).session_uid
 
     def on_preview(shown: Path) -> jobs.Steps:
-        scene_name = _scene_name(uid)
+        scene_name = scene_name_of(uid)
         if shown.suffix == ".json":
             yield from show_estimated_cameras(shown, job, scene_name)
             return
@@ -176,7 +176,7 @@ def start(python: Path, folder: Path, asked: Job, *, scene_name: str) -> None:
             yield from show_preview(shown, wanted)
 
     def on_finished(_: Finished) -> jobs.Steps:
-        yield from import_result_steps(folder, scene_name=_scene_name(uid), undo=not bpy.app.background)
+        yield from import_result_steps(folder, scene_name=scene_name_of(uid), undo=not bpy.app.background)
 
     jobs.start(
         "Reconstructing",
@@ -187,14 +187,6 @@ def start(python: Path, folder: Path, asked: Job, *, scene_name: str) -> None:
         on_preview=on_preview,
         on_end=remove_preview,
     )
-
-
-def _scene_name(uid: int) -> str:
-    """What the scene is called by now. Raises ValueError where it was removed."""
-    found = next((scene for scene in bpy.data.scenes if scene.session_uid == uid), None)
-    if found is None:
-        raise ValueError("the scene that the job was started in is no longer there")
-    return str(found.name)
 
 
 def _absolute(path: str) -> str:

@@ -12,6 +12,7 @@ from bpy.props import StringProperty
 from .. import jobs, render_worker, undo_step, view_cameras
 from ..arguments import argument, fill_in
 from ..job_folder import FolderError, new_folder
+from ..mesh_import import scene_name_of
 from ..properties import FEWVIEW_PG_settings, settings_of
 from ..solved import read_solved
 from ..true_mesh import WITH_SURFACE
@@ -150,7 +151,7 @@ class FEWVIEW_OT_render_views(bpy.types.Operator):
             folder = new_folder(jobs_parent(context, self.output), "views")
             if render_worker.needs_waiting():
                 render_worker.render_here(request, folder)
-                for _ in take_views(request.scene, folder):
+                for _ in take_views(context.scene.session_uid, folder):
                     pass
                 return {"FINISHED"}
             self._start(context.scene, request, folder)
@@ -180,29 +181,27 @@ class FEWVIEW_OT_render_views(bpy.types.Operator):
         if unsaved := render_worker.unsaved_images():
             self.report({"WARNING"}, f"Rendered as they were last saved: {', '.join(unsaved)}")
         render_worker.prepare(scene, request, folder)
+        scene_uid = scene.session_uid
         jobs.start(
             "Rendering views",
             render_worker.worker_command(folder),
             folder=folder,
             log_path=folder / render_worker.LOG,
-            on_finished=lambda _: take_views(request.scene, folder),
+            on_finished=lambda _: take_views(scene_uid, folder),
             on_end=partial(render_worker.clean, folder),
             environment=os.environ,
             noisy_start=True,
         )
 
 
-def take_views(scene_name: str, folder: Path) -> Iterator[None]:
+def take_views(scene_uid: int, folder: Path) -> Iterator[None]:
     """Make the rendered views of a folder what is reconstructed, with their cameras and the truth.
 
     In steps for a timer; the last is an undo step. Raises ValueError where the folder is not usable.
     """
     solved = read_solved(folder / TRANSFORMS)
     yield
-    scene = next((scene for scene in bpy.data.scenes if scene.name_full == scene_name), None)
-    if scene is None:
-        raise ValueError(f"the scene {scene_name} is no longer there")
-    settings: FEWVIEW_PG_settings = scene.fewview
+    settings: FEWVIEW_PG_settings = bpy.data.scenes[scene_name_of(scene_uid)].fewview
     settings.images.clear()
     add_images(settings, [folder / camera.name for camera in solved.cameras])
     settings.source, settings.camera_source = "RENDER", "KNOWN"

@@ -145,7 +145,6 @@ GREY = [
 ]
 FILE_BROWSER = {"filepath", "directory", "files", "filter_glob", "check_existing"}
 """Properties that Blender's file browser gives a meaning."""
-SAID_BY_ITS_NAME = {"resolution_x", "resolution_y"}
 SMALL_WORDS = {"a", "an", "and", "as", "at", "by", "for", "from", "in", "of", "on", "or", "the", "to", "with"}
 
 
@@ -227,7 +226,6 @@ def test_its_arguments_say_what_they_are(name: str) -> None:
         described = bool(argument.description) or (
             argument.type == "ENUM" and all(item.description for item in argument.enum_items)
         )
-        described = described or argument.identifier in SAID_BY_ITS_NAME
         assert described, f"{argument.identifier} has no description"
         assert not argument.description.endswith("."), argument.description
 
