@@ -57,6 +57,9 @@ check: .venv/.ready
 	$(BACKEND) -m ruff check
 	$(BACKEND) -m ruff format --check
 	$(BACKEND) -m mypy
+	@# The add-on is a package inside the extension, whose name is that of a folder: here a link to this one.
+	mkdir -p build/types && ln -sfn ../.. build/types/fewview
+	MYPYPATH=build/types $(BACKEND) -m mypy --package fewview.addon
 
 BENCHMARK := build/benchmark
 SCENES := $(addprefix $(BENCHMARK)/scenes/,monkey_3 monkey_6 plaster_6)

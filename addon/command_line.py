@@ -75,14 +75,17 @@ def _render(asked: argparse.Namespace) -> dict[str, object]:
     if target is None:
         known = ", ".join(o.name for o in bpy.context.scene.objects if o.type == "MESH")
         raise ValueError(f"There is no object {asked.object!r} in the scene; meshes: {known or 'none'}")
-    names = ("arrangement", "view_count", "view_seed", "resolution_x", "resolution_y")
-    placed = {name: value for name in names if (value := getattr(asked, name)) is not None}
-    names = ("samples", "engine", "resolution_x", "resolution_y")
-    rendered = {name: value for name in names if (value := getattr(asked, name)) is not None}
+    placed = _given(asked, "arrangement", "view_count", "view_seed", "resolution_x", "resolution_y")
+    rendered = _given(asked, "samples", "engine", "resolution_x", "resolution_y")
     bpy.ops.fewview.generate_views(target=target.name, **placed)
     bpy.ops.fewview.render_views(target=target.name, output=str(asked.output.absolute()), **rendered)
     settings = bpy.context.scene.fewview
     return {"transforms": settings.cameras_path, "images": [image.path for image in settings.images]}
+
+
+def _given(asked: argparse.Namespace, *names: str) -> dict[str, object]:
+    """The arguments that were given; operators know what to do without the others."""
+    return {name: value for name in names if (value := getattr(asked, name)) is not None}
 
 
 def _check(_asked: argparse.Namespace) -> dict[str, object]:

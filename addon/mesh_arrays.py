@@ -53,7 +53,7 @@ def mesh_arrays(mesh: PlyMesh, world_from_solved: NDArray[np.float64]) -> MeshAr
         raise ValueError("the mesh lies too far away or is too large for Blender")
     faces = proper_faces(mesh.faces)
     edges, corner_edges = edges_of(faces, len(positions))
-    colours = None if mesh.colours_srgb is None else mesh.colours_srgb / np.float32(255)
+    colours = None if mesh.colours_srgb is None else mesh.colours_srgb.astype(np.float32) / np.float32(255)
     return MeshArrays(
         positions=positions.astype(np.float32),
         edges=edges,
@@ -92,6 +92,6 @@ def linear_from_srgb(srgb: NDArray[np.float32]) -> NDArray[np.float32]:
 def _mean_linear(colours_srgb: NDArray[np.uint8] | None) -> tuple[float, float, float]:
     if colours_srgb is None or not len(colours_srgb):
         return (0.5, 0.5, 0.5)
-    linear = linear_from_srgb(np.arange(256, dtype=np.float32) / 255)
+    linear = linear_from_srgb(np.arange(256, dtype=np.float32) / np.float32(255))
     red, green, blue = (float(linear[colours_srgb[:, channel]].mean()) for channel in range(3))
     return (red, green, blue)

@@ -11,7 +11,7 @@ from concurrent.futures import ThreadPoolExecutor, wait
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import bpy
 import numpy as np
@@ -201,7 +201,7 @@ _WORKS = (_add_vertices, _add_corners, _fill_topology, _add_faces, _add_attribut
 """In this order; each is short, as what takes time is memory that Blender fills for the first time."""
 
 
-def _fill(mesh: bpy.types.Mesh, attribute: str, field: str, values: NDArray) -> None:
+def _fill(mesh: bpy.types.Mesh, attribute: str, field: str, values: NDArray[Any]) -> None:
     """Through the attribute, which is a copy of memory; `vertices`, `loops` and `edges` go one by one."""
     if values.size:
         mesh.attributes[attribute].data.foreach_set(field, np.ascontiguousarray(values).ravel())

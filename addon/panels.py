@@ -1,25 +1,25 @@
 """The sidebar: five steps, each with its state in one line and at most one main button."""
 
-import textwrap
 from pathlib import Path
+from typing import Any
 
 import bpy
 
 from . import jobs
 from .camera_objects import JOB
 from .colours import legend
+from .drawing import draw_button, draw_state, draw_text
 from .environment import State
 from .error_map import numbers_of
+from .job_boxes import draw_ended, draw_environment, draw_running
 from .job_folder import past_jobs
 from .operators.environment import backend_state
 from .operators.images import list_problems
 from .operators.reconstruct import jobs_parent
-from .progress import seconds_left, stage_words, time_words
 from .properties import settings_of
 from .result_mesh import result_or_none
 from .result_numbers import result_lines
 from .state_lines import (
-    READY,
     TODO,
     StepState,
     cameras_state,
@@ -32,10 +32,7 @@ from .state_lines import (
 )
 from .view_cameras import generated
 
-_SILENCE_S = 30.0
-_MAIN_SCALE = 1.5
 _MOST_PAST_JOBS = 8
-_PIXELS_PER_LETTER = 7.0
 
 
 class _Panel:
@@ -44,12 +41,17 @@ class _Panel:
     bl_space_type = "VIEW_3D"
     bl_region_type = "UI"
     bl_category = "FewView"
+    layout: bpy.types.UILayout
 
 
 class _Step(_Panel):
     """Mix-in: one of the five steps; its state is seen even where it is closed."""
 
     bl_parent_id = "FEWVIEW_PT_main"
+
+    def state(self, context: bpy.types.Context) -> StepState:
+        """How the step stands."""
+        raise NotImplementedError
 
     def draw_header_preset(self, context: bpy.types.Context) -> None:
         """At the right of the title."""
@@ -66,9 +68,9 @@ class FEWVIEW_PT_main(_Panel, bpy.types.Panel):
         """Above the steps."""
         job, end = jobs.running(), jobs.ended()
         if job is not None:
-            _draw_running(self.layout.box(), context, job)
+            draw_running(self.layout.box(), context, job)
         elif end is not None and (end.failure is not None or end.warnings):
-            _draw_ended(self.layout.box(), context, end)
+            draw_ended(self.layout.box(), context, end)
         if job is None and backend_state(context)[0] is State.NOT_READY:
             draw_environment(self.layout.box(), context)
 
@@ -76,7 +78,16 @@ class FEWVIEW_PT_main(_Panel, bpy.types.Panel):
 class FEWVIEW_UL_images(bpy.types.UIList):
     """The photographs"""
 
-    def draw_item(self, _context, layout, _data, item, _icon, _active, _property, *_):
+    def draw_item(
+        self,
+        _context: Any,
+        layout: Any,
+        _data: Any,
+        item: Any,
+        _icon: Any,
+        _active_data: Any,
+        _active_property: Any,
+    ) -> None:
         """A tick, the name, the size or what is wrong."""
         row = layout.row(align=True)
         row.prop(item, "use", text="")
@@ -100,13 +111,13 @@ class FEWVIEW_PT_images(_Step, bpy.types.Panel):
     def draw(self, context: bpy.types.Context) -> None:
         """Source, list, and what is wrong with it."""
         layout, settings = self.layout, settings_of(context)
-        _draw_state(layout, self.state(context))
+        draw_state(layout, self.state(context))
         layout.row().prop(settings, "source", expand=True)
         if settings.source == "RENDER":
             _draw_render(layout, context)
         elif not settings.images:
-            _button(layout, "fewview.add_images", icon="FILE_FOLDER", text="Add Photographs...")
-            _draw_text(layout, context, "3 to 20 pictures of one thing, each from a step further round it")
+            draw_button(layout, "fewview.add_images", icon="FILE_FOLDER", text="Add Photographs...")
+            draw_text(layout, context, "3 to 20 pictures of one thing, each from a step further round it")
         if settings.images:
             _draw_list(layout, context)
 
@@ -125,7 +136,7 @@ class FEWVIEW_PT_cameras(_Step, bpy.types.Panel):
     def draw(self, context: bpy.types.Context) -> None:
         """Where they come from, and who could not be placed."""
         layout, settings = self.layout, settings_of(context)
-        _draw_state(layout, self.state(context))
+        draw_state(layout, self.state(context))
         layout.row().prop(settings, "camera_source", expand=True)
         known = settings.camera_source == "KNOWN"
         if known:
@@ -135,7 +146,7 @@ class FEWVIEW_PT_cameras(_Step, bpy.types.Panel):
         row = layout.row(align=True)
         row.operator("fewview.estimate_cameras", icon="OUTLINER_DATA_CAMERA", text=text)
         if solved is None:
-            _draw_text(layout, context, "Not needed: do it to see the cameras before the mesh")
+            draw_text(layout, context, "Not needed: do it to see the cameras before the mesh")
             return
         row.operator("fewview.remove_cameras", icon="X", text="")
         if solved.reprojection_error_px is not None:
@@ -143,7 +154,7 @@ class FEWVIEW_PT_cameras(_Step, bpy.types.Panel):
         for name, why in solved.unplaced:
             box = layout.box()
             box.label(text=f"{name} could not be placed", icon="ERROR")
-            _draw_text(box, context, why)
+            draw_text(box, context, why)
 
 
 class FEWVIEW_PT_region(_Step, bpy.types.Panel):
@@ -160,11 +171,11 @@ class FEWVIEW_PT_region(_Step, bpy.types.Panel):
     def draw(self, context: bpy.types.Context) -> None:
         """A sphere, or nothing."""
         layout, settings = self.layout, settings_of(context)
-        _draw_state(layout, self.state(context))
+        draw_state(layout, self.state(context))
         region = in_scene(settings, settings.region)
         if region is None:
             layout.operator("fewview.add_region", icon="SPHERE")
-            _draw_text(layout, context, "Not needed: a sphere in the scene that you move and scale")
+            draw_text(layout, context, "Not needed: a sphere in the scene that you move and scale")
             return
         row = layout.row(align=True)
         row.operator("fewview.fit_region", icon="FULLSCREEN_EXIT", text="Fit to Subject")
@@ -186,12 +197,12 @@ class FEWVIEW_PT_reconstruct(_Step, bpy.types.Panel):
     def draw(self, context: bpy.types.Context) -> None:
         """Preset and start."""
         layout, settings = self.layout, settings_of(context)
-        _draw_state(layout, self.state(context))
+        draw_state(layout, self.state(context))
         layout.row().prop(settings, "preset", expand=True)
         ready = self.state(context).icon != TODO
         row = layout.row()
         row.enabled = ready
-        _button(row, "fewview.reconstruct", icon="MOD_REMESH", text="Reconstruct", main=ready)
+        draw_button(row, "fewview.reconstruct", icon="MOD_REMESH", text="Reconstruct", main=ready)
 
 
 class FEWVIEW_PT_advanced(_Panel, bpy.types.Panel):
@@ -226,7 +237,7 @@ class FEWVIEW_PT_result(_Step, bpy.types.Panel):
     def draw(self, context: bpy.types.Context) -> None:
         """The mesh, how far to trust it, and what to do with it."""
         layout, settings = self.layout, settings_of(context)
-        _draw_state(layout, self.state(context))
+        draw_state(layout, self.state(context))
         result = result_or_none(context)
         if result is None:
             return
@@ -238,7 +249,7 @@ class FEWVIEW_PT_result(_Step, bpy.types.Panel):
         row.operator("fewview.show_colour")
         row.operator("fewview.show_support")
         row.operator("fewview.show_error")
-        _draw_text(layout, context, legend(result.data))
+        draw_text(layout, context, legend(result.data))
         target = in_scene(settings, settings.target)
         if target is not None:
             row = layout.row(align=True)
@@ -246,7 +257,7 @@ class FEWVIEW_PT_result(_Step, bpy.types.Panel):
             row.prop(target, "hide_viewport", text="", emboss=True)
             numbers = numbers_of(result)
             if numbers is not None:
-                _draw_text(layout, context, numbers.text)
+                draw_text(layout, context, numbers.text)
         column = layout.column(align=True)
         row = column.row(align=True)
         row.prop(settings, "decimate_ratio")
@@ -274,71 +285,6 @@ class FEWVIEW_PT_past_jobs(_Panel, bpy.types.Panel):
             self.layout.label(text="None in the output folder")
 
 
-def draw_environment(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
-    """Whether there is a Python that can reconstruct, and how to get one."""
-    state, text = backend_state(context)
-    if state is State.READY:
-        layout.label(text="Ready to reconstruct", icon=READY)
-        _draw_text(layout, context, text)
-        return
-    if state is State.UNKNOWN:
-        layout.label(text="Not checked yet", icon="INFO")
-        _button(layout, "fewview.check_backend", icon="CHECKMARK", text="Check")
-        return
-    layout.label(text="Set up FewView once", icon="INFO")
-    _draw_text(layout, context, text)
-    _draw_text(layout, context, "It computes in a Python of its own, which is downloaded for it")
-    _button(layout, "fewview.install_backend", icon="IMPORT", text="Set Up...")
-    if not bpy.app.online_access:
-        _draw_text(layout, context, "Allow Online Access in Preferences > System first", icon="ERROR")
-        show = layout.operator("screen.userpref_show", text="Open Preferences", icon="PREFERENCES")
-        show.section = "SYSTEM"
-    row = layout.row(align=True)
-    row.operator("fewview.check_backend", text="Check Again")
-    row.operator("fewview.copy_install_lines", text="By Hand", icon="COPYDOWN")
-
-
-def _draw_running(layout: bpy.types.UILayout, context: bpy.types.Context, job: jobs.RunningJob) -> None:
-    left = seconds_left(job.share, job.elapsed_s)
-    layout.label(text=job.title, icon="TIME")
-    words = stage_words(job.stage) if job.stage else "Starting"
-    layout.progress(factor=job.share, text=f"{words}  {job.share:.0%}", type="BAR")
-    row = layout.row()
-    row.label(text=job.text)
-    if job.cancelling:
-        layout.label(text="Stopping...")
-    elif left is not None:
-        layout.label(text=f"About {time_words(left)} left")
-    if job.silent_s > _SILENCE_S:
-        _draw_text(layout, context, f"No sign of life for {time_words(job.silent_s)}")
-    for text in job.warnings[-2:]:
-        _draw_text(layout, context, text, icon="ERROR")
-    row = layout.row(align=True)
-    row.operator("fewview.cancel", icon="CANCEL")
-    row.operator("fewview.show_log", icon="TEXT")
-
-
-def _draw_ended(layout: bpy.types.UILayout, context: bpy.types.Context, end: jobs.EndedJob) -> None:
-    """What went wrong, or what the user should know."""
-    row = layout.row()
-    if end.cancelled:
-        row.label(text=f"{end.title} was cancelled", icon="CANCEL")
-    elif end.failure is not None:
-        row.label(text=f"{end.title} failed", icon="ERROR")
-    else:
-        row.label(text=f"{end.title} is done", icon="INFO")
-    row.operator("fewview.dismiss", icon="X", text="", emboss=False)
-    if end.failure is not None and not end.cancelled:
-        _draw_text(layout, context, end.failure.text.partition("\n")[0])
-        _draw_text(layout, context, end.failure.remedy, icon="FORWARD")
-    for text in end.warnings[:3]:
-        _draw_text(layout, context, text, icon="ERROR")
-    if end.failure is not None and not end.cancelled:
-        row = layout.row(align=True)
-        row.operator("fewview.show_log", icon="TEXT")
-        row.operator("fewview.copy_report", icon="COPYDOWN")
-
-
 def _draw_render(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
     settings = settings_of(context)
     column = layout.column()
@@ -355,13 +301,13 @@ def _draw_render(layout: bpy.types.UILayout, context: bpy.types.Context) -> None
             column.prop(settings, "elevation")
         made = bool(generated(context.scene))
         text = "Generate Again" if made else "Generate Cameras"
-        _button(layout, "fewview.generate_views", icon="OUTLINER_OB_CAMERA", text=text, main=not made)
+        draw_button(layout, "fewview.generate_views", icon="OUTLINER_OB_CAMERA", text=text, main=not made)
     elif settings.view_cameras == "ANIMATED":
         column.prop(settings, "frame_step")
     ready = settings.view_cameras != "GENERATED" or made
     if ready:
         main = not settings.images
-        _button(layout, "fewview.render_views", icon="RENDER_STILL", text="Render Views", main=main)
+        draw_button(layout, "fewview.render_views", icon="RENDER_STILL", text="Render Views", main=main)
 
 
 class FEWVIEW_PT_render(_Panel, bpy.types.Panel):
@@ -404,33 +350,9 @@ def _draw_list(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
     if 0 <= settings.active_image < len(settings.images):
         problem = settings.images[settings.active_image].problem
         if problem:
-            _draw_text(layout, context, problem, icon="ERROR")
+            draw_text(layout, context, problem, icon="ERROR")
     for problem in list_problems(settings):
-        _draw_text(layout, context, problem, icon="ERROR")
-
-
-def _button(layout: bpy.types.UILayout, operator: str, *, icon: str, text: str, main: bool = True) -> None:
-    """A button; the one to press next is larger."""
-    row = layout.row()
-    row.scale_y = _MAIN_SCALE if main else 1.0
-    row.operator(operator, icon=icon, text=text)
-
-
-def _draw_state(layout: bpy.types.UILayout, state: StepState) -> None:
-    layout.label(text=state.text, icon=state.icon)
-
-
-def _draw_text(
-    layout: bpy.types.UILayout, context: bpy.types.Context, text: str, *, icon: str = "NONE"
-) -> None:
-    """A sentence in as many lines as the sidebar is narrow; nothing for an empty one."""
-    scale = context.preferences.system.ui_scale or 1.0  # 0 without a window
-    width = context.region.width if context.region is not None else 300
-    letters = max(int(width / (_PIXELS_PER_LETTER * scale)) - (8 if icon != "NONE" else 5), 16)
-    column = layout.column(align=True)
-    column.scale_y = 0.8
-    for number, line in enumerate(textwrap.wrap(text, letters)):
-        column.label(text=line, icon=icon if number == 0 else ("BLANK1" if icon != "NONE" else "NONE"))
+        draw_text(layout, context, problem, icon="ERROR")
 
 
 CLASSES = (

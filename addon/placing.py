@@ -95,7 +95,8 @@ def inverse_similarity(b_from_a: Array) -> Array:
     matrix = np.asarray(b_from_a, np.float64)
     if matrix.shape != (4, 4) or not np.isfinite(matrix).all() or abs(np.linalg.det(matrix)) < 1e-30:
         raise ValueError("the placement cannot be turned back: one of its scales is 0")
-    return np.linalg.inv(matrix)
+    inverse: Array = np.asarray(np.linalg.inv(matrix), np.float64)
+    return inverse
 
 
 def sphere_around(points: Array, weights: Array | None = None) -> tuple[Array, float]:

@@ -12,6 +12,7 @@ import re
 import stat
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -176,7 +177,7 @@ def _mesh(body: bytes, layout: _Layout, name: str) -> PlyMesh:
     positions = _columns(vertices, _POSITION, np.float64)
     normals = _columns(vertices, _NORMAL, np.float32)
     support = next(
-        (_columns(vertices, (f,), np.float32) for f in _SUPPORT if f in vertices.dtype.names), None
+        (_columns(vertices, (f,), np.float32) for f in _SUPPORT if f in (vertices.dtype.names or ())), None
     )
     assert positions is not None
     for what, values in (("positions", positions), ("normals", normals), ("support", support)):
@@ -191,11 +192,13 @@ def _mesh(body: bytes, layout: _Layout, name: str) -> PlyMesh:
     )
 
 
-def _columns(vertices: NDArray[np.void], fields: tuple[str, ...], kind: type) -> NDArray | None:
+def _columns(
+    vertices: NDArray[np.void], fields: tuple[str, ...], kind: type[np.generic]
+) -> NDArray[Any] | None:
     """(vertices, fields), or None where the file does not have them all."""
     if not set(fields) <= set(vertices.dtype.names or ()):
         return None
-    columns = np.empty((len(vertices), len(fields)), kind)
+    columns: NDArray[Any] = np.empty((len(vertices), len(fields)), kind)
     with np.errstate(over="ignore"):  # a double that is no float becomes infinite, which is found later
         for index, field in enumerate(fields):
             columns[:, index] = vertices[field]

@@ -42,7 +42,7 @@ class FEWVIEW_AP_preferences(bpy.types.AddonPreferences):
 
     def draw(self, context: bpy.types.Context) -> None:
         """The page in Edit > Preferences > Add-ons."""
-        from .panels import draw_environment
+        from .job_boxes import draw_environment
 
         layout = self.layout
         layout.use_property_split = True

@@ -117,8 +117,9 @@ def _points_or_none(scene: bpy.types.Scene) -> tuple[NDArray[np.float64], NDArra
     weights = None
     confidence = mesh.attributes.get("confidence") or mesh.attributes.get("support")
     if confidence is not None and confidence.data_type == "FLOAT" and confidence.domain == "POINT":
-        weights = np.empty(len(mesh.vertices), np.float32)
-        confidence.data.foreach_get("value", weights)
+        values = np.empty(len(mesh.vertices), np.float32)
+        confidence.data.foreach_get("value", values)
+        weights = values.astype(np.float64)
     return flat.reshape(-1, 3) @ world[:3, :3].T + world[:3, 3], weights
 
 

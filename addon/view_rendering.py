@@ -7,7 +7,7 @@ FOLDER/images/000.png ...   8-bit RGBA, plain sRGB; alpha is the mask of the sub
 """
 
 import json
-from collections.abc import Iterable, Iterator
+from collections.abc import Generator, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -64,7 +64,7 @@ def decode_request(text: str) -> ViewRequest:
     return ViewRequest(views=views, **found)
 
 
-def render_views(request: ViewRequest, folder: Path) -> Iterator[tuple[int, Path]]:
+def render_views(request: ViewRequest, folder: Path) -> Generator[tuple[int, Path], None, None]:
     """Render the context's scene into a new folder, and give number and file of each view when it is done.
 
     The generator must be used up, or closed, before anything else touches the scene: only then is every

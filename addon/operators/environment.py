@@ -8,6 +8,7 @@ import bpy
 from bpy.props import BoolProperty, EnumProperty, StringProperty
 
 from ... import __package__ as EXTENSION
+from ...backend.wire.environment import python_in
 from .. import environment, jobs
 from ..environment import PythonMissing, State
 from ..preferences import preferences_of
@@ -161,7 +162,7 @@ class FEWVIEW_OT_install_backend(bpy.types.Operator):
         command = environment.install_command(
             sys.executable, folder, build=self._build(context), again=self.again
         )
-        return _run(self, "Install Backend", command, python=environment.python_in(folder), folder=folder)
+        return _run(self, "Install Backend", command, python=python_in(folder), folder=folder)
 
     def _build(self, context: bpy.types.Context) -> str:
         return preferences_of(context).torch_build if self.build == "PREFERENCES" else self.build
@@ -276,6 +277,7 @@ def _run(
             log_path=logs / f"{operator.bl_idname.rpartition('_OT_')[2]}.log",
             on_finished=lambda _: iter(()),
             on_end=keep,
+            about_scene=False,
         )
     except (jobs.JobError, OSError) as error:
         operator.report({"ERROR"}, str(error))

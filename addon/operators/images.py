@@ -1,9 +1,10 @@
 """Step 1: the list of photographs."""
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from errno import ENOENT
 from os import strerror
 from pathlib import Path
+from typing import ClassVar
 
 import bpy
 from bpy.props import CollectionProperty, StringProperty
@@ -131,6 +132,8 @@ class FEWVIEW_OT_add_images(bpy.types.Operator):
 
 class _OnList:
     """Mix-in of the operators that need a list with something on it."""
+
+    poll_message_set: ClassVar[Callable[[str], None]]
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:

@@ -1,5 +1,6 @@
 """Step 5: the mesh that came back, and what is done with it."""
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import ClassVar
 
@@ -67,12 +68,14 @@ class FEWVIEW_OT_import_result(bpy.types.Operator):
 class _Show(OnResult):
     kind: ClassVar[str]
     unavailable: ClassVar[str]
+    poll_message_set: ClassVar[Callable[[str], None]]
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
         if not has_result(cls, context):
             return False
-        if not colours.can_show(result_or_none(context).data, cls.kind):
+        result = result_or_none(context)
+        if result is None or not colours.can_show(result.data, cls.kind):
             cls.poll_message_set(cls.unavailable)
             return False
         return True

@@ -67,7 +67,7 @@ class Sidebar:
         for image in self.settings.images:
             row = fake_layout.FakeLayout()
             self.panels.FEWVIEW_UL_images.draw_item(
-                None, bpy.context, row, self.settings, image, 0, self.settings, "active_image", 0
+                None, bpy.context, row, self.settings, image, 0, self.settings, "active_image"
             )
             assert image.name in row.texts()
         return found
@@ -681,7 +681,7 @@ def test_a_narrow_sidebar_breaks_lines_and_loses_no_word(sidebar: Sidebar) -> No
     for width in (1, 120, 300, 2000):
         layout = fake_layout.FakeLayout()
         context = SimpleNamespace(preferences=bpy.context.preferences, region=SimpleNamespace(width=width))
-        sidebar.panels._draw_text(layout, context, text, icon="ERROR")
+        sidebar.panels.draw_text(layout, context, text, icon="ERROR")
         assert " ".join(layout.texts()) == text
         icons = [drawn.icon for drawn in layout.drawn]
         assert icons == ["ERROR"] + ["BLANK1"] * (len(icons) - 1)
