@@ -45,7 +45,7 @@ def needs_waiting() -> bool:
 def prepare(scene: bpy.types.Scene, request: ViewRequest, folder: Path) -> None:
     """Write what the second Blender reads: the request, and the scene with all that it uses.
 
-    Not by saving a copy of the file: Blender then takes the user's unsaved changes for saved.
+    Not by saving a copy of the file, which takes longer and runs the user's handlers.
     Raises RuntimeError or OSError where the copy cannot be written.
     """
     (folder / REQUEST).write_text(encode_request(request), encoding="utf-8")
