@@ -13,7 +13,7 @@ ROOT = Path(__file__).resolve().parents[2]
 def main(words: list[str]) -> int:
     """The exit code of pytest."""
     packages, *arguments = words
-    sys.path[:0] = [str(ROOT), packages]
+    sys.path[:0] = [str(ROOT), str(Path(packages).absolute())]
     import pytest
 
     chosen = arguments or [str(ROOT / "tests" / "blender")]

@@ -80,7 +80,8 @@ def test_a_real_job_is_followed_and_cancelled(addon: ModuleType, views: Path, tm
 def test_the_backend_ends_when_blender_dies(views: Path, tmp_path: Path, extension: str) -> None:
     """Killed amid a job, without a chance to clean up; within two seconds nothing of it is left."""
     script = tmp_path / "blender.py"
-    script.write_text(ORPHAN.format(here=str(Path(__file__)), extension=extension, views=str(views)))
+    names = {"here": str(Path(__file__)), "extension": extension, "views": str(views), "path": sys.path}
+    script.write_text(ORPHAN.format(**names))
     blender = (bpy.app.binary_path, "--background", "--python") if bpy.app.binary_path else (sys.executable,)
     with subprocess.Popen([*blender, str(script)], cwd=tmp_path, stdout=subprocess.DEVNULL) as process:
         pid_file = tmp_path / "pid"
@@ -101,6 +102,7 @@ def test_the_backend_ends_when_blender_dies(views: Path, tmp_path: Path, extensi
 
 ORPHAN = """
 import importlib.util, sys, time, pathlib
+sys.path[:] = {path!r}
 spec = importlib.util.spec_from_file_location("whole_way", {here!r})
 import bpy
 bpy.ops.preferences.addon_enable(module={extension!r})
