@@ -15,7 +15,7 @@ help:
 	@echo "make extension   the zip to install in Blender"
 	@echo "make test-blender BLENDER=blender   the add-on's tests in a real Blender"
 	@echo "make screenshots BLENDER=blender    the pictures of the add-on in docs/images"
-	@echo "make benchmark   speed against error, as a table"
+	@echo "make benchmark SUITE=quick   speed against error: table and plot; also scenes, photos"
 
 demo: .venv/.ready $(DEMO)/scene/transforms.json
 	$(BACKEND) -m backend reconstruct $(DEMO)/scene/images --cameras $(DEMO)/scene/transforms.json \
@@ -62,18 +62,16 @@ check: .venv/.ready
 	MYPYPATH=build/types $(BACKEND) -m mypy --package fewview.addon
 
 BENCHMARK := build/benchmark
-SCENES := $(addprefix $(BENCHMARK)/scenes/,monkey_3 monkey_6 plaster_6)
-PHOTOS ?= $(wildcard ../shared/data)
+SUITE ?= quick
+SEEDS ?= $(if $(filter quick,$(SUITE)),1,3)
+DATA ?= $(wildcard ../shared/data)
 
-benchmark: .venv/.ready $(addsuffix /transforms.json,$(SCENES))
-	$(BACKEND) benchmarks/measure.py --scenes $(BENCHMARK)/scenes --output $(BENCHMARK) \
-	    $(if $(PHOTOS),--photos $(PHOTOS))
-
-# A scene's folder is its name and its number of views: three are taken over 40 degrees, six over 120.
-$(BENCHMARK)/scenes/%/transforms.json: .venv-blender/.ready $(wildcard blender_scenes/*.py)
-	$(BPY) -m blender_scenes.render_views --scene $(firstword $(subst _, ,$*)) \
-	    --views $(lastword $(subst _, ,$*)) --layout arc \
-	    --arc-deg $(if $(filter 3,$(lastword $(subst _, ,$*))),40,120) --output $(@D)
+# Renders what is missing or out of date, then measures from nothing.
+benchmark: .venv/.ready .venv-blender/.ready
+	$(BPY) -m benchmarks.render_scenes $(SUITE) --output $(BENCHMARK)/scenes $(if $(DATA),--data $(DATA))
+	rm -rf $(BENCHMARK)/$(SUITE)
+	$(BACKEND) -m backend benchmark $(SUITE) --output $(BENCHMARK)/$(SUITE) --seeds $(SEEDS) \
+	    --scenes $(BENCHMARK)/scenes $(if $(DATA),--photos $(DATA))
 
 .venv/.ready: pyproject.toml constraints.txt
 	$(PYTHON) -m venv .venv

@@ -1,4 +1,4 @@
-"""The command line: python -m backend reconstruct | doctor | install | rehearse."""
+"""The command line: python -m backend reconstruct | doctor | install | rehearse | benchmark."""
 
 import argparse
 import faulthandler
@@ -10,6 +10,7 @@ from typing import Any
 
 from . import doctor
 from .commands import install
+from .commands.benchmark import add_benchmark, benchmark
 from .commands.doctor import doctor_on_wire
 from .commands.reconstruct import EXIT_FINE, EXIT_USER_ERROR, on_terminal, on_wire
 from .commands.rehearse import rehearse
@@ -36,6 +37,8 @@ def run(arguments: list[str] | None) -> int:
         return _doctor(as_json=parsed.json, on_wire=parsed.wire)
     if parsed.command == "install":
         return _install(parsed)
+    if parsed.command == "benchmark":
+        return benchmark(parsed)
     if parsed.command == "rehearse":
         return rehearse(parsed.output, seconds=parsed.seconds, end=parsed.end)
     return _reconstruct(parser, parsed)
@@ -113,6 +116,7 @@ def _parser() -> argparse.ArgumentParser:
     rehearsal.add_argument("--output", metavar="DIR", type=Path, help="new folder for a toy mesh")
     rehearsal.add_argument("--seconds", metavar="S", type=_number, default=1.0, help="how long it takes (1)")
     rehearsal.add_argument("--end", choices=("finished", "failed", "crashed"), default="finished")
+    add_benchmark(commands.add_parser("benchmark", help="measure speed against error"))
     return parser
 
 

@@ -1,0 +1,1 @@
+"""Speed against error: suites of photographs with known answers, and what is made of their runs."""

@@ -1,0 +1,68 @@
+"""How well a mesh's colours repeat photographs that it was not made from."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+
+from ..maths.metrics import psnr
+from ..maths.raycast import RayCaster, render_mesh
+from ..scene import SurfaceMesh, View, no_progress
+from ..stages.cameras import CamerasConfig, solve_cameras
+from ..stages.photos import PhotosConfig, load_photos
+from .suites import Case, image_paths
+
+MAX_SIDE_PX = 800
+"""Photographs are compared at this size, whatever the preset."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class HeldOutFit:
+    """Means over the held-out views."""
+
+    psnr_db: float | None
+    """Where a view has a mask, over all of the mask: surface that is missing counts as black. Else over what
+    the mesh covers. None where no view has a finite number."""
+    covered_share: float
+    """Of the mask, or of the picture where there is none."""
+
+
+def held_out_views(case: Case, folder: Path) -> tuple[View, ...]:
+    """The case's held-out photographs with their cameras, undistorted. Raises ReconstructionError."""
+    assert case.cameras is not None
+    masks = None if case.masks is None else folder / case.masks
+    paths = image_paths(case, folder, case.held_out)
+    photos = load_photos(paths, masks, PhotosConfig(max_side_px=MAX_SIDE_PX), progress=no_progress)
+    with TemporaryDirectory() as scratch:
+        return solve_cameras(
+            photos,
+            folder / case.cameras,
+            CamerasConfig(),
+            workdir=Path(scratch),
+            seed=0,
+            progress=no_progress,
+        ).views
+
+
+def held_out_fit(mesh: SurfaceMesh, views: Sequence[View]) -> HeldOutFit:
+    """Colours of a mesh (world frame) against at least one view."""
+    caster = RayCaster(mesh.vertices, mesh.faces)
+    fits = [_fit(mesh, view, caster) for view in views]
+    finite = [value for value, _ in fits if value is not None and math.isfinite(value)]
+    return HeldOutFit(
+        psnr_db=sum(finite) / len(finite) if finite else None,
+        covered_share=sum(share for _, share in fits) / len(fits),
+    )
+
+
+def _fit(mesh: SurfaceMesh, view: View, caster: RayCaster) -> tuple[float | None, float]:
+    """PSNR in dB and the share that is covered."""
+    image = render_mesh(mesh, view.camera, caster=caster)
+    if view.mask is None:
+        return psnr(view.image_srgb, image.colour_srgb, image.coverage), float(image.coverage.mean())
+    inside = np.asarray(view.mask > 0.5)
+    covered = float(image.coverage[inside].mean()) if inside.any() else 0.0
+    return psnr(view.image_srgb, image.colour_srgb, inside), covered

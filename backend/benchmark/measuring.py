@@ -1,0 +1,121 @@
+"""One run, in a process of its own, because a process knows only one peak of its memory; and its numbers."""
+
+import json
+import os
+import time
+from collections import deque
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from ..commands.cancelling import CancelRequest
+from ..commands.child import run_child
+from ..errors import ReconstructionError
+from ..mesh_files import read_mesh
+from ..wire.client import ROOT, clean_environment
+from .held_out import held_out_fit, held_out_views
+from .suites import Case, image_paths
+
+_WITH_KNOWN_CAMERAS = ("region", "stereo", "train", "mesh")
+"""The stages after the cameras."""
+_ERRORS = (
+    "chamfer_percent",
+    "accuracy_percent",
+    "completeness_percent",
+    "f_score_at_half_percent",
+    "f_score_at_one_percent",
+    "normal_consistency",
+)
+
+Numbers = Mapping[str, float | None]
+"""By name; the unit is its last word. None where there is nothing to measure, as without a truth."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Trial:
+    """What is to be run."""
+
+    case: Case
+    folder: Path
+    """Of the case."""
+    preset: str
+    seed: int
+    device: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class Measurement:
+    """What a run gave."""
+
+    case: str
+    preset: str
+    seed: int
+    numbers: Numbers
+    """Empty where the run failed."""
+    versions: Mapping[str, str]
+    failure: str | None = None
+    """What the run, or the comparison with held-out views, said last."""
+
+
+def measure(trial: Trial, output: Path, *, program: tuple[str, ...], request: CancelRequest) -> Measurement:
+    """Run the trial from nothing into `output`, a folder that is not there yet.
+
+    `program` is the command that starts the backend. Raises Cancelled.
+    """
+    last_lines: deque[str] = deque(maxlen=2)
+    started = time.perf_counter()
+    exit_code = run_child(
+        (*program, *reconstruct_words(trial, output)),
+        environment=clean_environment(os.environ),
+        folder=ROOT,
+        request=request,
+        on_line=lambda line: last_lines.append(line.strip()) if line.strip() else None,
+    )
+    wall_s = time.perf_counter() - started
+    done = partial(Measurement, case=trial.case.name, preset=trial.preset, seed=trial.seed)
+    if exit_code:
+        words = " ".join(last_lines) or f"ended with exit code {exit_code}"
+        return done(numbers={}, versions={}, failure=words)
+    report = json.loads((output / "report.json").read_text(encoding="utf-8"))
+    numbers = {**report_numbers(report), "wall_s": wall_s}
+    failure = None
+    if trial.case.held_out:
+        try:
+            numbers |= _held_out_numbers(trial, output)
+        except ReconstructionError as error:
+            failure = str(error)
+    return done(numbers=numbers, versions=report["versions"], failure=failure)
+
+
+def reconstruct_words(trial: Trial, output: Path) -> tuple[str, ...]:
+    """The trial as words of the command line; the held-out images are not among them."""
+    case, folder = trial.case, trial.folder.absolute()
+    files = {"--cameras": case.cameras, "--masks": case.masks, "--truth": case.truth}
+    options = {option: str(folder / name) for option, name in files.items() if name is not None}
+    options |= {"--preset": trial.preset, "--seed": str(trial.seed), "--device": trial.device}
+    images = (str(path) for path in image_paths(case, folder, case.given))
+    words = (word for option in options.items() for word in option)
+    return ("reconstruct", *images, *words, "--output", str(output.absolute()))
+
+
+def report_numbers(report: Mapping[str, Any]) -> dict[str, float | None]:
+    """What a run's report.json says, flat."""
+    seconds = {stage["name"]: float(stage["seconds"]) for stage in report["stages"]}
+    numbers: dict[str, float | None] = {f"{name}_s": value for name, value in seconds.items()}
+    numbers["after_cameras_s"] = sum(seconds[name] for name in _WITH_KNOWN_CAMERAS)
+    numbers["total_s"] = report["total_seconds"]
+    numbers["peak_memory_bytes"] = report["peak_memory_bytes"]
+    numbers["given_psnr_db"] = report["mean_psnr_db"]
+    error = report["error"] or {}
+    for part in ("visible", "whole"):
+        found = error.get(part) or {}
+        numbers |= {f"{part}_{name}": found.get(name) for name in _ERRORS}
+    return numbers
+
+
+def _held_out_numbers(trial: Trial, output: Path) -> dict[str, float | None]:
+    views = held_out_views(trial.case, trial.folder)
+    fit = held_out_fit(read_mesh(output / "mesh.ply"), views)
+    return {"held_out_psnr_db": fit.psnr_db, "held_out_covered_share": fit.covered_share}

@@ -1,0 +1,118 @@
+"""The command that measures speed against error over a suite of cases."""
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from ..benchmark.suites import SUITES, Found, find_cases
+from ..errors import ErrorCode, ReconstructionError
+from ..wire.client import backend_command
+from ..wire.protocol import DEVICES, PRESETS
+from .cancelling import CancelRequest, watch_signals
+from .reconstruct import settle
+
+if TYPE_CHECKING:
+    from ..benchmark.measuring import Measurement
+
+
+def add_benchmark(parser: argparse.ArgumentParser) -> None:
+    """The command's words."""
+    add = parser.add_argument
+    add("suite", choices=tuple(SUITES), help="what to measure")
+    add("--output", metavar="DIR", type=Path, required=True, help="new or empty folder")
+    add("--scenes", metavar="DIR", type=Path, help="the suite's scenes, as make renders them")
+    add("--photos", metavar="DIR", type=Path, help="the sets of real photographs")
+    add("--presets", nargs="+", choices=PRESETS, default=["fast", "balanced"])
+    add("--seeds", type=_count, metavar="N", default=3, help="how often to run everything (3)")
+    add("--device", choices=DEVICES, default="auto", help="where to compute (auto)")
+
+
+def benchmark(parsed: argparse.Namespace, *, program: Sequence[str] | None = None) -> int:
+    """Measure the suite and leave results.json, table.md and plot.svg; the exit code.
+
+    `program` is the command that starts the backend: by default this one.
+    """
+    request = CancelRequest()
+    watch_signals(request, lambda: None)
+    command = tuple(program or backend_command(sys.executable))
+    return settle(
+        lambda: _measure_all(parsed, command, request),
+        failed=lambda error: _say(f"Error: {error.text}\n{error.remedy}"),
+        cancelled=lambda: _say(f"Stopped; what was measured is in {parsed.output}."),
+    )
+
+
+def _measure_all(parsed: argparse.Namespace, program: tuple[str, ...], request: CancelRequest) -> None:
+    # Here, so that the other commands start without torch; and before hours of work, if one is missing.
+    from ..benchmark.measuring import Trial, measure
+    from ..benchmark.writing import machine_facts, write_results
+
+    found = find_cases(SUITES[parsed.suite], parsed.scenes, parsed.photos)
+    _check(parsed, found)
+    about = {
+        "suite": parsed.suite,
+        "presets": parsed.presets,
+        "seeds": list(range(parsed.seeds)),
+        "device": parsed.device,
+        "machine": machine_facts(),
+        "missing": found.missing,
+    }
+    if found.missing:
+        _say(f"Left out, because their files are not there: {', '.join(found.missing)}")
+    runs: list[Measurement] = []
+    for case, folder in found.cases:
+        for preset in parsed.presets:
+            for seed in range(parsed.seeds):
+                trial = Trial(case=case, folder=folder, preset=preset, seed=seed, device=parsed.device)
+                output = parsed.output / "runs" / f"{case.name}-{preset}-{seed}"
+                runs.append(measure(trial, output, program=program, request=request))
+                _say(_line(runs[-1]))
+                write_results(parsed.output, about, runs)
+    sys.stdout.write(f"{parsed.output / 'table.md'}\n")
+
+
+def _check(parsed: argparse.Namespace, found: Found) -> None:
+    """ReconstructionError where there is nothing to measure or no place for it."""
+    if not found.cases:
+        raise ReconstructionError(
+            ErrorCode.NO_PHOTOS,
+            f"None of the cases of {parsed.suite} is there.",
+            "Run `make benchmark`, which renders the scenes, or give --scenes and --photos.",
+        )
+    output: Path = parsed.output
+    if output.exists() and (not output.is_dir() or any(output.iterdir())):
+        raise ReconstructionError(
+            ErrorCode.OUTPUT_UNUSABLE,
+            f"{output} is not an empty folder.",
+            "Choose a new folder for --output.",
+        )
+    output.mkdir(parents=True, exist_ok=True)
+
+
+def _line(run: "Measurement") -> str:
+    """A run in a line for a person who waits."""
+    name = f"{run.case}, {run.preset}, seed {run.seed}"
+    if run.failure is not None:
+        return f"{name}: {run.failure}"
+    words = [f"{run.numbers['after_cameras_s']:.1f} s after the cameras"]
+    known = (
+        ("visible_chamfer_percent", "visible Chamfer {:.3f} %"),
+        ("held_out_psnr_db", "held out {:.1f} dB"),
+    )
+    values = ((run.numbers.get(number), text) for number, text in known)
+    return (
+        f"{name}: {', '.join([*words, *(text.format(value) for value, text in values if value is not None)])}"
+    )
+
+
+def _say(text: str) -> None:
+    sys.stderr.write(text + "\n")
+
+
+def _count(text: str) -> int:
+    number = int(text)
+    if number < 1:
+        raise argparse.ArgumentTypeError("must be 1 or more")
+    return number

@@ -1,0 +1,80 @@
+"""Renders the scenes of a benchmark's suite that are not there yet; run by Blender's Python.
+
+    python -m benchmarks.render_scenes SUITE --output build/benchmark/scenes [--data ../shared/data]
+
+A scene is rendered again when its options or the sources of blender_scenes have changed. Without --data the
+cases that start from a mesh file are left out.
+"""
+
+import argparse
+import hashlib
+import logging
+import subprocess
+import sys
+from pathlib import Path
+
+from backend.benchmark.suites import SUITES, Case
+
+ROOT = Path(__file__).resolve().parents[1]
+NOTE = "rendered_from.txt"
+"""In a scene's folder, written last: the fingerprint of all it was made from."""
+MESH_SUFFIXES = frozenset({".obj", ".ply", ".stl", ".glb", ".gltf"})
+logger = logging.getLogger(__name__)
+
+
+def render_words(case: Case, output: Path, data: Path | None) -> tuple[str, ...] | None:
+    """The case as words for blender_scenes.render_views; None where its mesh file is not there."""
+    assert case.rendering is not None
+    scene = case.rendering.scene
+    if Path(scene).suffix in MESH_SUFFIXES:
+        if data is None or not (data / scene).is_file():
+            return None
+        scene = f"mesh:{data.absolute() / scene}"
+    return ("--scene", scene, *case.rendering.words, "--output", str(output.absolute()))
+
+
+def fingerprint(words: tuple[str, ...]) -> str:
+    """Changes with the options and with the code that renders."""
+    digest = hashlib.sha256(repr(words).encode())
+    sources = [*sorted((ROOT / "blender_scenes").glob("*.py")), ROOT / "addon" / "view_layout.py"]
+    for path in sources:
+        digest.update(path.read_bytes())
+    return digest.hexdigest()
+
+
+def render_missing(cases: tuple[Case, ...], scenes: Path, data: Path | None) -> int:
+    """Render what is missing or out of date; the first exit code that is not 0."""
+    for case in cases:
+        folder = scenes / case.folder
+        words = render_words(case, folder, data)
+        note = folder / NOTE
+        if words is None:
+            logger.info("%s is left out: its mesh file is not there", case.name)
+            continue
+        if note.is_file() and note.read_text(encoding="utf-8") == fingerprint(words):
+            continue
+        logger.info("rendering %s", case.name)
+        command = [sys.executable, "-m", "blender_scenes.render_views", *words]
+        exit_code = subprocess.run(command, cwd=ROOT, check=False).returncode
+        if exit_code:
+            return exit_code
+        note.write_text(fingerprint(words), encoding="utf-8")
+    return 0
+
+
+def main() -> int:
+    """The exit code."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("suite", choices=tuple(SUITES))
+    parser.add_argument("--output", type=Path, required=True)
+    parser.add_argument("--data", type=Path, help="folder of mesh files")
+    parsed = parser.parse_args()
+    logging.basicConfig(level=logging.INFO, format="%(message)s", stream=sys.stderr)
+    cases = tuple(case for case in SUITES[parsed.suite].cases if case.rendering is not None)
+    return render_missing(cases, parsed.output, parsed.data)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,155 @@
+"""The whole command with small stages in place of the real ones: what it runs, leaves and survives."""
+
+import json
+import sys
+from argparse import ArgumentParser, Namespace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from backend.benchmark import suites
+from backend.benchmark.suites import Case, Suite
+from backend.commands import benchmark as command
+from backend.commands.cancelling import EXIT_CANCELLED, CancelRequest
+from backend.commands.reconstruct import EXIT_FINE, EXIT_USER_ERROR
+
+# The small stages of the end-to-end tests, but for photographs given as files rather than as a folder.
+PROGRAM = """
+import sys
+from pathlib import Path
+from backend.commands import reconstruct
+from tests.end_to_end import fake_stages
+
+folder_stage = fake_stages.load_photos
+
+def load_photos(sources, masks, config, *, progress):
+    assert [path.name for path in sources] == ["0.png", "2.png", "4.png"]
+    return folder_stage((sources[0].parent,), masks, config, progress=progress)
+
+load_photos.__annotations__ = folder_stage.__annotations__
+fake_stages.load_photos = load_photos
+fake_stages.real_resolve = reconstruct.resolve
+reconstruct.resolve = fake_stages.resolve_and_replace
+sys.exit(fake_stages.main(sys.argv[4:]))
+"""
+CASE = Case(name="toy", folder="toy", given=(0, 2, 4), held_out=(1, 3))
+LOST = Case(name="lost", folder="lost", given=(0, 1, 2))
+pytestmark = pytest.mark.slow
+
+
+def fake_program(trouble: str = "none") -> tuple[str, ...]:
+    return (sys.executable, "-c", PROGRAM, trouble, "train", "0")
+
+
+@pytest.fixture
+def photos(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder of photo sets with five pictures whose alpha cuts out the middle, and cameras for them."""
+    images = tmp_path / "photos" / "toy" / "images"
+    images.mkdir(parents=True)
+    pixels = np.zeros((24, 32, 4), np.uint8)
+    pixels[6:18, 8:24] = 255
+    pose = np.diag([1.0, -1.0, -1.0, 1.0]).tolist()
+    frames = []
+    for index in range(5):
+        Image.fromarray(pixels).save(images / f"{index}.png")
+        frames.append({"file_path": f"images/{index}.png", "transform_matrix": pose})
+    cameras = {"w": 32, "h": 24, "fl_x": 30.0, "fl_y": 30.0, "cx": 16.0, "cy": 12.0, "frames": frames}
+    (images.parent / "transforms.json").write_text(json.dumps(cameras))
+    toy = {"toy": Suite(name="toy", cases=(LOST, CASE))}
+    monkeypatch.setattr(command, "SUITES", {**suites.SUITES, **toy})
+    monkeypatch.setattr(command, "watch_signals", lambda *_: None)  # pytest's own Ctrl-C stays as it is
+    monkeypatch.setenv("DONE_LOG", str(tmp_path / "done"))
+    return tmp_path / "photos"
+
+
+def parsed(photos: Path, output: Path, *more: str) -> Namespace:
+    parser = ArgumentParser()
+    command.add_benchmark(parser)
+    words = ["toy", "--photos", str(photos), "--output", str(output), "--device", "cpu", *more]
+    return parser.parse_args(words)
+
+
+def test_everything_is_run_measured_and_written(
+    photos: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    output = tmp_path / "out"
+    words = parsed(photos, output, "--seeds", "2", "--presets", "fast")
+    assert command.benchmark(words, program=fake_program()) == EXIT_FINE
+    assert {path.name for path in output.iterdir()} == {"results.json", "table.md", "plot.svg", "runs"}
+    results = json.loads((output / "results.json").read_text())
+    assert results["missing"] == ["lost"]
+    assert results["seeds"] == [0, 1]
+    assert results["versions"]["torch"]
+    assert results["machine"]["cores"] >= 1
+    assert [(run["case"], run["preset"], run["seed"]) for run in results["runs"]] == [
+        ("toy", "fast", 0),
+        ("toy", "fast", 1),
+    ]
+    numbers = results["runs"][0]["numbers"]
+    stages = ("photos_s", "cameras_s", "region_s", "stereo_s", "train_s", "mesh_s")
+    assert numbers["total_s"] == pytest.approx(sum(numbers[name] for name in stages))
+    assert numbers["after_cameras_s"] == pytest.approx(sum(numbers[name] for name in stages[2:]))
+    assert numbers["wall_s"] > numbers["total_s"]
+    assert numbers["peak_memory_bytes"] > 1e7
+    assert 0.0 <= numbers["held_out_covered_share"] <= 1.0
+    assert numbers["visible_chamfer_percent"] is None
+    assert "| toy | fast |" in (output / "table.md").read_text()
+    said = capsys.readouterr()
+    assert "lost" in said.err
+    assert said.out.strip() == str(output / "table.md")
+
+
+def test_a_run_that_fails_is_told_and_the_next_goes_on(photos: Path, tmp_path: Path) -> None:
+    output = tmp_path / "out"
+    words = parsed(photos, output, "--seeds", "1")
+    assert command.benchmark(words, program=fake_program("memory")) == EXIT_FINE
+    runs = json.loads((output / "results.json").read_text())["runs"]
+    assert [run["preset"] for run in runs] == ["fast", "balanced"]
+    assert all(run["numbers"] == {} and "memory" in run["failure"] for run in runs)
+
+
+def test_held_out_views_without_cameras_are_told_and_the_rest_is_kept(photos: Path, tmp_path: Path) -> None:
+    path = photos / "toy" / "transforms.json"
+    cameras = json.loads(path.read_text())
+    path.write_text(json.dumps({**cameras, "frames": cameras["frames"][::2]}))
+    output = tmp_path / "out"
+    words = parsed(photos, output, "--seeds", "1", "--presets", "fast")
+    assert command.benchmark(words, program=fake_program()) == EXIT_FINE
+    (run,) = json.loads((output / "results.json").read_text())["runs"]
+    assert run["numbers"]["total_s"] > 0
+    assert "held_out_psnr_db" not in run["numbers"]
+    assert "camera" in run["failure"]
+
+
+def test_a_folder_with_something_in_it_is_not_touched(
+    photos: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    output = tmp_path / "out"
+    output.mkdir()
+    (output / "mine.txt").write_text("mine")
+    assert command.benchmark(parsed(photos, output), program=fake_program()) == EXIT_USER_ERROR
+    assert [path.name for path in output.iterdir()] == ["mine.txt"]
+    assert "not an empty folder" in capsys.readouterr().err
+
+
+def test_a_stop_ends_the_run_and_says_so(
+    photos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def stop_at_once(request: CancelRequest, _on_first: object) -> None:
+        request.ask()
+
+    monkeypatch.setattr(command, "watch_signals", stop_at_once)
+    assert command.benchmark(parsed(photos, tmp_path / "out"), program=fake_program()) == EXIT_CANCELLED
+    assert "Stopped" in capsys.readouterr().err
+    assert not (tmp_path / "done").exists()
+
+
+def test_nothing_to_measure_is_told_with_a_remedy(
+    photos: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    nowhere = parsed(tmp_path / "nowhere", tmp_path / "out")
+    assert command.benchmark(nowhere, program=fake_program()) == EXIT_USER_ERROR
+    assert not (tmp_path / "out").exists()
+    assert "make benchmark" in capsys.readouterr().err
