@@ -102,7 +102,7 @@ def test_the_backend_ends_when_blender_dies(views: Path, tmp_path: Path, extensi
 
 ORPHAN = """
 import importlib.util, sys, time, pathlib
-sys.path[:] = {path!r}
+sys.path += [folder for folder in {path!r} if folder not in sys.path]
 spec = importlib.util.spec_from_file_location("whole_way", {here!r})
 import bpy
 bpy.ops.preferences.addon_enable(module={extension!r})
