@@ -1,11 +1,17 @@
 """Arguments of operators that stand for settings of the scene where they are left out."""
 
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import bpy
 
 from .properties import FEWVIEW_PG_settings
+
+
+def absolute(path: str) -> str:
+    """The path that a user gave, as another program needs it: without // for the .blend's folder."""
+    return str(Path(bpy.path.abspath(path)).absolute())
 
 
 def argument(setting: str) -> Any:

@@ -23,6 +23,7 @@ from .intrinsics import Pinhole, aspect_pair, shared_aspect_or_none
 from .job_folder import CAMERAS, RESULT, SPARSE
 from .placing import upright_from_solved
 from .ply import PlyMesh, read_ply
+from .scenes import scene_named
 from .solved import SolvedCamera, SolvedScene, read_solved
 
 JOB, ROLE, PHOTO, SIZE = "fewview_job", "fewview_role", "fewview_photo", "fewview_size"
@@ -65,13 +66,13 @@ def import_steps(scene_name: str, wanted: CameraImport) -> Iterator[None]:
     Raises ValueError for a camera that Blender does not have.
     """
     for camera in wanted.solved.cameras:
-        _make_camera(_scene(scene_name), wanted, camera)
+        _make_camera(scene_named(scene_name), wanted, camera)
         yield
-    _remove_old_cameras(_scene(scene_name), wanted)
-    set_pixel_aspect(_scene(scene_name), wanted.solved)
+    _remove_old_cameras(scene_named(scene_name), wanted)
+    set_pixel_aspect(scene_named(scene_name), wanted.solved)
     yield
     if wanted.points is not None and len(wanted.points.positions):
-        _make_points(_scene(scene_name), wanted, wanted.points)
+        _make_points(scene_named(scene_name), wanted, wanted.points)
 
 
 def problems(wanted: CameraImport) -> tuple[str, ...]:
@@ -180,13 +181,6 @@ def remove_object(made: bpy.types.Object) -> None:
     bpy.data.objects.remove(made)
     if data is not None and data.users == 0:
         bpy.data.batch_remove([data])
-
-
-def _scene(name: str) -> bpy.types.Scene:
-    found = bpy.data.scenes.get(name)
-    if found is None:
-        raise ValueError(f"the scene {name} is no longer there")
-    return found
 
 
 def _make_root(scene: bpy.types.Scene, wanted: CameraImport) -> None:

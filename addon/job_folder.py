@@ -73,15 +73,20 @@ def write_job(folder: Path, job: Job) -> Path:
     return path
 
 
-def read_job(folder: Path) -> PastJob:
-    """The job of a folder that has a mesh. Raises FolderError where there is none or it is damaged."""
+def read_job_file(folder: Path) -> Job:
+    """What was asked for. Raises FolderError where the file is missing or damaged."""
     path = folder / JOB_FILE
     try:
         if path.stat().st_size > _LARGEST_JOB_BYTES:
             raise FolderError(f"{path} is too large to be a job")
-        job = decode_job(path.read_text(encoding="utf-8"))
+        return decode_job(path.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError, ProtocolError) as error:
         raise FolderError(f"{path} cannot be read: {error}") from error
+
+
+def read_job(folder: Path) -> PastJob:
+    """The job of a folder that has a mesh. Raises FolderError where there is none or it is damaged."""
+    job = read_job_file(folder)
     inside(folder, folder / job.output)
     if not (folder / RESULT / MESH).is_file():
         raise FolderError(f"The job {folder.name} has no mesh yet")

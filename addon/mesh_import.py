@@ -23,6 +23,7 @@ from .camera_objects import JOB, ROLE
 from .heat_map import SUPPORT
 from .mesh_arrays import MeshArrays, mesh_arrays
 from .ply import PlyMesh, read_ply
+from .scenes import scene_named
 
 MESH, PREVIEW = "mesh", "preview"
 """Values of `fewview_role`."""
@@ -98,22 +99,6 @@ def remove_preview() -> None:
         bpy.data.objects.remove(preview)
         if mesh is not None and mesh.users == 0:
             bpy.data.meshes.remove(mesh)
-
-
-def scene_named(name: str) -> bpy.types.Scene:
-    """The scene. Raises ValueError where the user has removed or renamed it meanwhile."""
-    found = bpy.data.scenes.get(name)
-    if found is None:
-        raise ValueError(f"the scene {name} is no longer there")
-    return found
-
-
-def scene_name_of(uid: int) -> str:
-    """What the scene with this `session_uid` is called by now. Raises ValueError where it was removed."""
-    found = next((scene for scene in bpy.data.scenes if scene.session_uid == uid), None)
-    if found is None:
-        raise ValueError("the scene that the job was started in is no longer there")
-    return str(found.name)
 
 
 def view_layer_of(scene: bpy.types.Scene) -> bpy.types.ViewLayer:

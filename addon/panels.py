@@ -19,12 +19,12 @@ from .operators.reconstruct import jobs_parent
 from .properties import settings_of
 from .result_mesh import result_or_none
 from .result_numbers import result_lines
+from .scenes import in_scene
 from .state_lines import (
     TODO,
     StepState,
     cameras_state,
     images_state,
-    in_scene,
     reconstruct_state,
     region_state,
     result_state,
@@ -172,7 +172,7 @@ class FEWVIEW_PT_region(_Step, bpy.types.Panel):
         """A sphere, or nothing."""
         layout, settings = self.layout, settings_of(context)
         draw_state(layout, self.state(context))
-        region = in_scene(settings, settings.region)
+        region = in_scene(context.scene, settings.region)
         if region is None:
             layout.operator("fewview.add_region", icon="SPHERE")
             draw_text(layout, context, "Not needed: a sphere in the scene that you move and scale")
@@ -250,7 +250,7 @@ class FEWVIEW_PT_result(_Step, bpy.types.Panel):
         row.operator("fewview.show_support")
         row.operator("fewview.show_error")
         draw_text(layout, context, legend(result.data))
-        target = in_scene(settings, settings.target)
+        target = in_scene(context.scene, settings.target)
         if target is not None:
             row = layout.row(align=True)
             row.operator("fewview.measure_error", icon="DRIVER_DISTANCE")

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from .camera_objects import JOB, POINTS, ROLE, world_from_solved
 from .job_folder import CAMERAS, RESULT, inside
 from .placing import region_in_solved, sphere_around
+from .scenes import in_scene
 from .solved import read_solved
 from .true_mesh import bounding_sphere, subject_of, true_mesh
 
@@ -22,7 +23,7 @@ Sphere = tuple[NDArray[np.float64], float]
 
 def region_or_none(scene: bpy.types.Scene) -> bpy.types.Object | None:
     """The empty, if the scene has one."""
-    return _of_scene(scene, scene.fewview.region)
+    return in_scene(scene, scene.fewview.region)
 
 
 def region_of(scene: bpy.types.Scene) -> Sphere | None:
@@ -38,7 +39,7 @@ def region_of(scene: bpy.types.Scene) -> Sphere | None:
 
 def world_from_root(scene: bpy.types.Scene) -> NDArray[np.float64]:
     """(4, 4) similarity `world_from_solved` of the scene; the identity where cameras are known."""
-    return world_from_solved(_of_scene(scene, scene.fewview.root))
+    return world_from_solved(in_scene(scene, scene.fewview.root))
 
 
 def place_region(scene: bpy.types.Scene, sphere: Sphere) -> bpy.types.Object:
@@ -90,14 +91,9 @@ def fitted(scene: bpy.types.Scene) -> tuple[Sphere, str]:
     raise ValueError("There is nothing to fit the region to: estimate the cameras first, or choose an object")
 
 
-def _of_scene(scene: bpy.types.Scene, made: bpy.types.Object | None) -> bpy.types.Object | None:
-    """A pointer keeps an object that the user has deleted from the scene."""
-    return made if made is not None and scene.objects.get(made.name) == made else None
-
-
 def _job(scene: bpy.types.Scene) -> str:
     """Folder of the job that the scene's cameras come from; empty where there is none."""
-    root = _of_scene(scene, scene.fewview.root)
+    root = in_scene(scene, scene.fewview.root)
     if root is not None and root.get(JOB):
         return str(root[JOB])
     return bpy.path.abspath(scene.fewview.cameras_job) if scene.fewview.cameras_job else ""
@@ -141,7 +137,7 @@ def _backend_sphere(scene: bpy.types.Scene) -> Sphere | None:
 
 def _target_sphere(scene: bpy.types.Scene) -> Sphere | None:
     """Around the object that the views were rendered of."""
-    target = _of_scene(scene, scene.fewview.target)
+    target = in_scene(scene, scene.fewview.target)
     if target is None:
         return None
     try:

@@ -11,8 +11,9 @@ from . import camera_lens, undo_step
 from .camera_objects import POINTS, ROLE, CameraImport, import_steps, objects_of, read_import, root_or_none
 from .frames import frame_owner, has_own_frame, world_from_solved_or_none
 from .job_folder import CAMERAS, MESH, PastJob, inside, read_job
-from .mesh_import import MeshImport, import_mesh, read_in_steps, scene_named
+from .mesh_import import MeshImport, import_mesh, read_in_steps
 from .placing import upright_from_solved
+from .scenes import scene_named
 from .solved import SolvedScene, read_solved
 
 _SAME_PLACE = 1e-4

@@ -10,6 +10,7 @@ import numpy as np
 from . import colours
 from .camera_objects import ROLE
 from .mesh_import import MESH, view_layer_of
+from .scenes import in_scene
 
 FORMATS = (".glb", ".ply", ".obj", ".stl")
 _MODIFIER = "fewview_decimate"
@@ -23,12 +24,8 @@ def result_or_none(context: bpy.types.Context) -> bpy.types.Object | None:
     active = context.view_layer.objects.active
     if active is not None and active.type == "MESH" and active.get(ROLE) == MESH:
         return active
-    last = context.scene.fewview.result
-    return (
-        last
-        if last is not None and last.type == "MESH" and context.scene.objects.get(last.name) == last
-        else None
-    )
+    last = in_scene(context.scene, context.scene.fewview.result)
+    return last if last is not None and last.type == "MESH" else None
 
 
 def decimate(result: bpy.types.Object, ratio: float) -> None:

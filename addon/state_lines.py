@@ -8,6 +8,7 @@ import bpy
 from .job_folder import CAMERAS, RESULT
 from .operators.images import list_problems
 from .properties import FEWVIEW_PG_settings
+from .scenes import in_scene
 from .solved import SolvedScene, read_solved
 
 READY, TODO, TROUBLE, AUTOMATIC = "CHECKMARK", "RADIOBUT_OFF", "ERROR", "DOT"
@@ -52,7 +53,7 @@ def cameras_state(settings: FEWVIEW_PG_settings) -> StepState:
 
 def region_state(settings: FEWVIEW_PG_settings) -> StepState:
     """Step 3."""
-    if in_scene(settings, settings.region) is None:
+    if in_scene(settings.id_data, settings.region) is None:
         return StepState(icon=AUTOMATIC, text="Found automatically")
     return StepState(icon=READY, text="Set by the sphere in the scene")
 
@@ -61,7 +62,7 @@ def reconstruct_state(settings: FEWVIEW_PG_settings) -> StepState:
     """Step 4."""
     if sum(image.use for image in settings.images) < FEWEST_IMAGES:
         return StepState(icon=TODO, text="Add photographs in step 1 first")
-    if in_scene(settings, settings.result) is None:
+    if in_scene(settings.id_data, settings.result) is None:
         return StepState(icon="PLAY", text="Ready to start")
     return StepState(icon=READY, text="Done; start again as you like")
 
@@ -71,11 +72,6 @@ def result_state(result: bpy.types.Object | None) -> StepState:
     if result is None:
         return StepState(icon=TODO, text="No mesh yet")
     return StepState(icon=READY, text=result.name)
-
-
-def in_scene(settings: FEWVIEW_PG_settings, made: bpy.types.Object | None) -> bpy.types.Object | None:
-    """The object of a setting; None where it was deleted: the setting keeps it alive, out of the scene."""
-    return made if made is not None and settings.id_data.objects.get(made.name) == made else None
 
 
 def solved_or_none(settings: FEWVIEW_PG_settings) -> SolvedScene | None:

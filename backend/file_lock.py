@@ -23,6 +23,6 @@ else:
         try:
             fcntl.flock(file.fileno(), fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError as error:
-            # Some network drives know no locks: an installation there is better than none.
+            # Some network drives know no locks: work there is better than none.
             return error.errno not in (errno.EWOULDBLOCK, errno.EACCES)
         return True

@@ -7,20 +7,19 @@
 Nothing outside of these names is ever written, replaced or removed.
 """
 
-import errno
 import hashlib
 import json
 import logging
 import shutil
-import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import BinaryIO, TypeVar
+from typing import TypeVar
 
 from .errors import ErrorCode, ReconstructionError
 from .failures import is_disk_full
+from .file_lock import lock
 from .records import RecordUnreadable, load_record, read_note, save_record
 
 T = TypeVar("T")
@@ -140,11 +139,11 @@ def open_workspace(folder: Path) -> Iterator[Workspace]:
     private = folder / PRIVATE
     try:
         private.mkdir(parents=True, exist_ok=True)
-        lock = (private / _LOCK).open("ab")
+        lock_file = (private / _LOCK).open("ab")
     except OSError as error:
         raise _not_writable(folder, error) from error
-    with lock:
-        if not _locked(lock):
+    with lock_file:
+        if not lock(lock_file):
             raise ReconstructionError(
                 ErrorCode.OUTPUT_UNUSABLE,
                 f"Another run is writing to {folder}.",
@@ -232,27 +231,3 @@ def _not_writable(folder: Path, error: OSError) -> Exception:
         f"{folder} cannot be written ({error.strerror or error}).",
         "Choose a folder for --output that you may write to.",
     )
-
-
-if sys.platform == "win32":
-    import msvcrt
-
-    def _locked(file: BinaryIO) -> bool:
-        """Whether the file is now locked by this process; the system unlocks it when the process ends."""
-        try:
-            msvcrt.locking(file.fileno(), msvcrt.LK_NBLCK, 1)
-        except OSError:
-            return False
-        return True
-
-else:
-    import fcntl
-
-    def _locked(file: BinaryIO) -> bool:
-        """Whether the file is now locked by this process; the system unlocks it when the process ends."""
-        try:
-            fcntl.flock(file.fileno(), fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as error:
-            # Some network drives know no locks: a run there is better than none.
-            return error.errno not in (errno.EWOULDBLOCK, errno.EACCES)
-        return True

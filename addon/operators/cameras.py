@@ -8,17 +8,15 @@ import bpy
 from bpy.props import StringProperty
 
 from ...backend.wire.client import backend_command
-from ...backend.wire.protocol import PROTOCOL_VERSION, Job, ProtocolError, decode_job
+from ...backend.wire.protocol import PROTOCOL_VERSION, Job
 from .. import camera_objects, jobs, undo_step
-from ..arguments import argument, fill_in
-from ..job_folder import JOB_FILE, LOG, RESULT, FolderError, new_folder, write_job
-from ..mesh_import import scene_name_of
+from ..arguments import absolute, argument, fill_in
+from ..job_folder import LOG, RESULT, FolderError, new_folder, read_job_file, write_job
 from ..properties import settings_of
+from ..scenes import scene_name_of
 from .environment import backend_python_or_reason
 from .images import used_images
 from .reconstruct import jobs_parent
-
-_LARGEST_JOB_BYTES = 1_000_000
 
 
 class FEWVIEW_OT_estimate_cameras(bpy.types.Operator):
@@ -69,7 +67,7 @@ class FEWVIEW_OT_estimate_cameras(bpy.types.Operator):
                 log_path=folder / LOG,
                 on_finished=partial(_on_finished, context.scene.session_uid, folder),
             )
-        except (FolderError, ValueError, OSError, jobs.JobError) as error:
+        except (ValueError, OSError, jobs.JobError) as error:
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
         return jobs.follow(self)
@@ -87,8 +85,8 @@ class FEWVIEW_OT_estimate_cameras(bpy.types.Operator):
             protocol=PROTOCOL_VERSION,
             images=tuple(str(path) for path in images),
             output=RESULT,
-            cameras=_absolute(self.cameras_path) if known else None,
-            masks=_absolute(self.masks) if self.masks else None,
+            cameras=absolute(self.cameras_path) if known else None,
+            masks=absolute(self.masks) if self.masks else None,
             preset=self.preset,
             device=self.device,
             seed=self.seed,
@@ -117,7 +115,7 @@ class FEWVIEW_OT_import_cameras(bpy.types.Operator):
             if not chosen:
                 raise ValueError("There is no job folder: choose one, or find cameras first")
             warnings: list[str] = []
-            for _ in show_cameras(context.scene.name, Path(_absolute(chosen)), warnings):
+            for _ in show_cameras(context.scene.name, Path(absolute(chosen)), warnings):
                 pass
         except (ValueError, RuntimeError) as error:
             self.report({"ERROR"}, f"The cameras cannot be imported: {error}")
@@ -220,18 +218,10 @@ def _on_finished(scene_uid: int, folder: Path, _: object) -> Iterator[None]:
 
 def _photographs(folder: Path, scene_name: str) -> tuple[Path, ...]:
     """The job's photographs, or those of the list where the job's file does not say."""
-    path = folder / JOB_FILE
     try:
-        if path.stat().st_size <= _LARGEST_JOB_BYTES:
-            images = decode_job(path.read_text(encoding="utf-8")).images
-            return tuple(folder / image for image in images)
-    except (OSError, UnicodeDecodeError, ProtocolError):
-        pass
-    return used_images(bpy.data.scenes[scene_name].fewview)
-
-
-def _absolute(path: str) -> str:
-    return str(Path(bpy.path.abspath(path)).absolute())
+        return tuple(folder / image for image in read_job_file(folder).images)
+    except FolderError:
+        return used_images(bpy.data.scenes[scene_name].fewview)
 
 
 def _look_through(context: bpy.types.Context) -> None:

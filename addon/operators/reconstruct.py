@@ -9,15 +9,16 @@ from bpy.props import FloatVectorProperty, StringProperty
 from ...backend.wire.client import backend_command
 from ...backend.wire.protocol import PROTOCOL_VERSION, Finished, Job
 from .. import jobs
-from ..arguments import argument, fill_in
+from ..arguments import absolute, argument, fill_in
 from ..frames import world_from_solved_or_none
 from ..job_folder import CAMERAS, LOG, RESULT, PastJob, new_folder, write_job
-from ..mesh_import import MeshImport, remove_preview, scene_name_of, scene_named, show_preview
+from ..mesh_import import MeshImport, remove_preview, show_preview
 from ..preferences import preferences_of
 from ..properties import FEWVIEW_PG_settings, settings_of
 from ..region import region_of
 from ..report_text import report_text
 from ..result_import import import_result_steps, show_estimated_cameras
+from ..scenes import scene_name_of, scene_named
 from ..solved import read_solved
 from ..state_lines import FEWEST_IMAGES
 from .environment import backend_python_or_reason
@@ -49,7 +50,7 @@ def cameras_for(settings: FEWVIEW_PG_settings, images: Sequence[Path]) -> str | 
     if settings.camera_source == "KNOWN":
         if not settings.cameras_path:
             raise ValueError("No file with known cameras is chosen: choose one in step 2, or Estimate")
-        return _absolute(settings.cameras_path)
+        return absolute(settings.cameras_path)
     if not settings.cameras_job:
         return None
     path = Path(bpy.path.abspath(settings.cameras_job)) / RESULT / CAMERAS
@@ -126,12 +127,12 @@ class FEWVIEW_OT_reconstruct(bpy.types.Operator):
         """Raises ValueError with the remedy where something is missing."""
         settings = settings_of(context)
         if self.images:
-            images = tuple(Path(_absolute(line.strip())) for line in self.images.splitlines() if line.strip())
+            images = tuple(Path(absolute(line.strip())) for line in self.images.splitlines() if line.strip())
         else:
             images = used_images(settings)
             if len(images) < FEWEST_IMAGES:
                 raise ValueError("There are too few photographs: add at least three in step 1")
-        cameras = _absolute(self.cameras) if self.cameras else None
+        cameras = absolute(self.cameras) if self.cameras else None
         if cameras is None and not self.images:
             cameras = cameras_for(settings, images)
         centre, radius = self._region(context)
@@ -140,11 +141,11 @@ class FEWVIEW_OT_reconstruct(bpy.types.Operator):
             images=tuple(str(path) for path in images),
             output=RESULT,
             cameras=cameras,
-            masks=_absolute(self.masks) if self.masks else None,
+            masks=absolute(self.masks) if self.masks else None,
             preset=self.preset,
             device=self.device,
             seed=self.seed,
-            truth=_absolute(self.truth) if self.truth else None,
+            truth=absolute(self.truth) if self.truth else None,
             region_centre=centre,
             region_radius=radius,
         )
@@ -187,10 +188,6 @@ def start(python: Path, folder: Path, asked: Job, *, scene_name: str) -> None:
         on_preview=on_preview,
         on_end=remove_preview,
     )
-
-
-def _absolute(path: str) -> str:
-    return str(Path(bpy.path.abspath(path)).absolute())
 
 
 class FEWVIEW_OT_cancel(bpy.types.Operator):

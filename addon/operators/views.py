@@ -11,9 +11,9 @@ from bpy.props import StringProperty
 
 from .. import jobs, render_worker, undo_step, view_cameras
 from ..arguments import argument, fill_in
-from ..job_folder import FolderError, new_folder
-from ..mesh_import import scene_name_of
+from ..job_folder import new_folder
 from ..properties import FEWVIEW_PG_settings, settings_of
+from ..scenes import in_scene, scene_name_of
 from ..solved import read_solved
 from ..true_mesh import WITH_SURFACE
 from ..view_cameras import ViewPlan
@@ -155,7 +155,7 @@ class FEWVIEW_OT_render_views(bpy.types.Operator):
                     pass
                 return {"FINISHED"}
             self._start(context.scene, request, folder)
-        except (FolderError, ValueError, OSError, RuntimeError) as error:
+        except (ValueError, OSError, RuntimeError) as error:
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
         return jobs.follow(self)
@@ -216,8 +216,7 @@ def take_views(scene_uid: int, folder: Path) -> Iterator[None]:
 def _target(context: bpy.types.Context, operator: bpy.types.Operator) -> bpy.types.Object | None:
     """The object of the argument, or of the scene's settings where there is none. Raises ValueError."""
     if not operator.properties.is_property_set("target"):
-        target = settings_of(context).target
-        return target if target is not None and target.name in context.scene.objects else None
+        return in_scene(context.scene, settings_of(context).target)
     if not operator.target:
         return None
     found = context.scene.objects.get(operator.target)

@@ -2,9 +2,9 @@
 
 from ..doctor import Check, examine, is_ready, not_ready
 from ..wire import protocol
-from ..wire.speaker import Speaker, speaker
-from .cancelling import CancelRequest, catch_signals, watch_signals, watch_stdin
-from .reconstruct import failed_message, hello, say_last, settle
+from ..wire.speaker import Speaker
+from .cancelling import CancelRequest, catch_signals
+from .reconstruct import converse, say_last
 
 _CANCELLED = protocol.Failed(
     code=protocol.CANCELLED, text="The check was stopped.", remedy="Check again when you like."
@@ -13,16 +13,7 @@ _CANCELLED = protocol.Failed(
 
 def doctor_on_wire() -> int:
     """Say each check as it is made, then whether a reconstruction can start here; the exit code."""
-    request = CancelRequest()
-    with speaker() as speaking:
-        speaking.say(hello())
-        watch_signals(request, lambda: None)
-        watch_stdin(request)
-        return settle(
-            lambda: _check(request, speaking),
-            failed=lambda error: say_last(speaking, failed_message(error)),
-            cancelled=lambda: say_last(speaking, _CANCELLED),
-        )
+    return converse(_check, _CANCELLED)
 
 
 def _check(request: CancelRequest, speaking: Speaker) -> None:

@@ -7,7 +7,6 @@ installation goes on where it was: the packages that pip has fetched are in its 
 
 import hashlib
 import os
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -18,13 +17,13 @@ from ..version import VERSION
 from ..wire import protocol
 from ..wire.client import ROOT, clean_environment
 from ..wire.environment import BUILDS, CONSTRAINTS, PART, RECORD, beside, python_in, requirements
-from ..wire.speaker import Speaker, speaker
+from ..wire.speaker import Speaker
 from . import environment_folder as folders
-from .cancelling import CancelRequest, watch_signals, watch_stdin
+from .cancelling import CancelRequest
 from .child import run_child
 from .installer import Installer
 from .packages import install_packages, pip_environment
-from .reconstruct import failed_message, hello, say_last, settle
+from .reconstruct import converse, say_last
 from .virtual_environment import make_environment, works
 
 _STAGES = ("python", "packages", "check")
@@ -55,25 +54,12 @@ class Plan:
 def install(plan: Plan) -> int:
     """Make the environment, with messages on stdout; the exit code."""
     whole = replace(plan, folder=plan.folder.absolute())
-    return _on_wire(lambda request, speaking: _install(whole, request, speaking))
+    return converse(lambda request, speaking: _install(whole, request, speaking), _CANCELLED)
 
 
 def remove(folder: Path) -> int:
     """Remove an environment that `install` made, with messages on stdout; the exit code."""
-    return _on_wire(lambda _, speaking: _remove(folder.absolute(), speaking))
-
-
-def _on_wire(work: Callable[[CancelRequest, Speaker], None]) -> int:
-    request = CancelRequest()
-    with speaker() as speaking:
-        speaking.say(hello())
-        watch_signals(request, lambda: None)
-        watch_stdin(request)
-        return settle(
-            lambda: work(request, speaking),
-            failed=lambda error: say_last(speaking, failed_message(error)),
-            cancelled=lambda: say_last(speaking, _CANCELLED),
-        )
+    return converse(lambda _, speaking: _remove(folder.absolute(), speaking), _CANCELLED)
 
 
 def _remove(folder: Path, speaking: Speaker) -> None:

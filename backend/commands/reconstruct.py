@@ -46,15 +46,23 @@ def on_terminal(job: protocol.Job) -> int:
 
 def on_wire(job_path: Path) -> int:
     """Run the job of the file with messages on stdout; the exit code."""
+    return converse(lambda request, speaking: _run_job_file(job_path, request, speaking), cancelled_message())
+
+
+def converse(work: Callable[[CancelRequest, Speaker], None], cancelled: protocol.Failed) -> int:
+    """Do the work between the first message on stdout and its last; the exit code.
+
+    The work says its own `Finished`; `cancelled` is the last word where it was asked to stop.
+    """
     request = CancelRequest()
     with speaker() as speaking:
         speaking.say(hello())
         watch_signals(request, lambda: None)
         watch_stdin(request)
         return settle(
-            lambda: _run_job_file(job_path, request, speaking),
+            lambda: work(request, speaking),
             failed=lambda error: say_last(speaking, failed_message(error)),
-            cancelled=lambda: say_last(speaking, cancelled_message()),
+            cancelled=lambda: say_last(speaking, cancelled),
         )
 
 

@@ -12,10 +12,10 @@ from pathlib import Path
 
 from ..errors import ErrorCode, ReconstructionError
 from ..wire import protocol
-from ..wire.speaker import Speaker, speaker
+from ..wire.speaker import Speaker
 from . import rehearsed_files as files
-from .cancelling import CancelRequest, watch_signals, watch_stdin
-from .reconstruct import cancelled_message, failed_message, hello, say_last, settle
+from .cancelling import CancelRequest
+from .reconstruct import cancelled_message, converse, say_last
 
 ENDS = ("finished", "failed", "crashed")
 """How a rehearsal can end."""
@@ -34,16 +34,9 @@ def rehearse(output: Path | None, seconds: float = 1.0, *, end: str = "finished"
     With an output folder, which must be new, it gets previews and results. `end` is one of ENDS: "failed"
     runs out of memory, "crashed" aborts without a last word, both amid the stage that fits the surface.
     """
-    request = CancelRequest()
-    with speaker() as speaking:
-        speaking.say(hello())
-        watch_signals(request, lambda: None)
-        watch_stdin(request)
-        return settle(
-            lambda: _play(output, seconds, end, request, speaking),
-            failed=lambda error: say_last(speaking, failed_message(error)),
-            cancelled=lambda: say_last(speaking, cancelled_message()),
-        )
+    return converse(
+        lambda request, speaking: _play(output, seconds, end, request, speaking), cancelled_message()
+    )
 
 
 def _play(output: Path | None, seconds: float, end: str, request: CancelRequest, speaking: Speaker) -> None:

@@ -1,0 +1,24 @@
+"""Scenes and objects found again, after the user has had time to rename, delete or undo."""
+
+import bpy
+
+
+def scene_named(name: str) -> bpy.types.Scene:
+    """The scene. Raises ValueError where the user has removed or renamed it meanwhile."""
+    found = bpy.data.scenes.get(name)
+    if found is None:
+        raise ValueError(f"the scene {name} is no longer there")
+    return found
+
+
+def scene_name_of(uid: int) -> str:
+    """What the scene with this `session_uid` is called by now. Raises ValueError where it was removed."""
+    found = next((scene for scene in bpy.data.scenes if scene.session_uid == uid), None)
+    if found is None:
+        raise ValueError("the scene that the job was started in is no longer there")
+    return str(found.name)
+
+
+def in_scene(scene: bpy.types.Scene, made: bpy.types.Object | None) -> bpy.types.Object | None:
+    """The object of a setting; None where it was deleted: the setting keeps it alive, out of the scene."""
+    return made if made is not None and scene.objects.get(made.name) == made else None
