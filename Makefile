@@ -15,7 +15,7 @@ help:
 	@echo "make extension   the zip to install in Blender"
 	@echo "make test-blender BLENDER=blender   the add-on's tests in a real Blender"
 	@echo "make screenshots BLENDER=blender    the pictures of the add-on in docs/images"
-	@echo "make benchmark SUITE=quick   speed against error: table and plot; also scenes, photos"
+	@echo "make benchmark SUITE=quick   speed against error: table and plot; also scenes, photos; BUDGETS=\"10 20\""
 
 demo: .venv/.ready $(DEMO)/scene/transforms.json
 	$(BACKEND) -m backend reconstruct $(DEMO)/scene/images --cameras $(DEMO)/scene/transforms.json \
@@ -64,6 +64,8 @@ check: .venv/.ready
 BENCHMARK := build/benchmark
 SUITE ?= quick
 SEEDS ?= $(if $(filter quick,$(SUITE)),1,3)
+# Seconds for fitting the surface, to measure each preset with as well: BUDGETS="10 20 40 80 160".
+BUDGETS ?=
 DATA ?= $(wildcard ../shared/data)
 
 # Renders what is missing or out of date, then measures from nothing.
@@ -71,7 +73,7 @@ benchmark: .venv/.ready .venv-blender/.ready
 	$(BPY) -m benchmarks.render_scenes $(SUITE) --output $(BENCHMARK)/scenes $(if $(DATA),--data $(DATA))
 	rm -rf $(BENCHMARK)/$(SUITE)
 	$(BACKEND) -m backend benchmark $(SUITE) --output $(BENCHMARK)/$(SUITE) --seeds $(SEEDS) \
-	    --scenes $(BENCHMARK)/scenes $(if $(DATA),--photos $(DATA))
+	    $(if $(BUDGETS),--budgets $(BUDGETS)) --scenes $(BENCHMARK)/scenes $(if $(DATA),--photos $(DATA))
 
 .venv/.ready: pyproject.toml constraints.txt
 	$(PYTHON) -m venv .venv

@@ -10,7 +10,7 @@ from typing import Any
 
 from . import doctor
 from .commands import install
-from .commands.benchmark import add_benchmark, benchmark
+from .commands.benchmark import add_benchmark, benchmark, positive_seconds
 from .commands.doctor import doctor_on_wire
 from .commands.reconstruct import EXIT_FINE, EXIT_USER_ERROR, on_terminal, on_wire
 from .commands.rehearse import rehearse
@@ -52,14 +52,17 @@ def _reconstruct(parser: argparse.ArgumentParser, parsed: argparse.Namespace) ->
         if radius <= 0:
             parser.error("--region: the radius must be positive")
         region = {"region_centre": tuple(centre), "region_radius": radius}
+    budget = {} if parsed.budget_seconds is None else {"budget_s": parsed.budget_seconds}
     if len(parsed.images) == 1 and parsed.images[0].endswith(".json"):
-        options = [*given, *(["region"] if region else [])]
+        options = [*given, *(["region"] if region else []), *(["budget-seconds"] if budget else [])]
         if options:
             parser.error(f"with a job file, {', '.join('--' + name for name in options)} stands in the file")
         return on_wire(Path(parsed.images[0]))
     if "output" not in given:
         parser.error("--output is needed")
-    return on_terminal(Job(protocol=PROTOCOL_VERSION, images=tuple(parsed.images), **given, **region))
+    return on_terminal(
+        Job(protocol=PROTOCOL_VERSION, images=tuple(parsed.images), **given, **region, **budget)
+    )
 
 
 def _doctor(*, as_json: bool, on_wire: bool) -> int:
@@ -106,6 +109,12 @@ def _parser() -> argparse.ArgumentParser:
         type=_number,
         metavar=("X", "Y", "Z", "RADIUS"),
         help="sphere to reconstruct, in the frame of the cameras; else it is found",
+    )
+    add(
+        "--budget-seconds",
+        type=positive_seconds,
+        metavar="S",
+        help="time for fitting the surface, the rest of the run not counted (what the preset needs)",
     )
     check = commands.add_parser("doctor", help="check that everything needed is there")
     form = check.add_mutually_exclusive_group()

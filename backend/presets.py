@@ -8,7 +8,7 @@ from .stages.mesh import MeshConfig
 from .stages.photos import PhotosConfig
 from .stages.region import RegionConfig
 from .stages.report import ReportConfig
-from .stages.stereo import StereoConfig
+from .stages.stereo_config import StereoConfig
 from .stages.train import TrainConfig
 
 

@@ -22,6 +22,11 @@ def no_progress(_fraction: float, _text: str) -> None:
     """A progress callback that shows nothing and never cancels."""
 
 
+def within(progress: Progress, first: float, last: float) -> Progress:
+    """Tells of a part of the work, which goes from `first` to `last` of the whole."""
+    return lambda fraction, text: progress(first + (last - first) * fraction, text)
+
+
 @dataclass(frozen=True, kw_only=True)
 class Decision:
     """Something modelled or left out, and the measurement that decided it; shown in the report."""

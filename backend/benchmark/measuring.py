@@ -43,6 +43,8 @@ class Trial:
     preset: str
     seed: int
     device: str
+    budget_s: float | None = None
+    """For the field stage; None for what the preset needs."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,6 +57,7 @@ class Measurement:
     numbers: Numbers
     """Empty where the run failed."""
     versions: Mapping[str, str]
+    budget_s: float | None = None
     failure: str | None = None
     """What the run, or the comparison with held-out views, said last."""
 
@@ -74,7 +77,13 @@ def measure(trial: Trial, output: Path, *, program: tuple[str, ...], request: Ca
         on_line=lambda line: last_lines.append(line.strip()) if line.strip() else None,
     )
     wall_s = time.perf_counter() - started
-    done = partial(Measurement, case=trial.case.name, preset=trial.preset, seed=trial.seed)
+    done = partial(
+        Measurement,
+        case=trial.case.name,
+        preset=trial.preset,
+        budget_s=trial.budget_s,
+        seed=trial.seed,
+    )
     if exit_code:
         words = " ".join(last_lines) or f"ended with exit code {exit_code}"
         return done(numbers={}, versions={}, failure=words)
@@ -95,6 +104,8 @@ def reconstruct_words(trial: Trial, output: Path) -> tuple[str, ...]:
     files = {"--cameras": case.cameras, "--masks": case.masks, "--truth": case.truth}
     options = {option: str(folder / name) for option, name in files.items() if name is not None}
     options |= {"--preset": trial.preset, "--seed": str(trial.seed), "--device": trial.device}
+    if trial.budget_s is not None:
+        options["--budget-seconds"] = f"{trial.budget_s:g}"
     images = (str(path) for path in image_paths(case, folder, case.given))
     words = (word for option in options.items() for word in option)
     return ("reconstruct", *images, *words, "--output", str(output.absolute()))
@@ -112,6 +123,7 @@ def report_numbers(report: Mapping[str, Any]) -> dict[str, float | None]:
     for part in ("visible", "whole"):
         found = error.get(part) or {}
         numbers |= {f"{part}_{name}": found.get(name) for name in _ERRORS}
+    numbers["support_auc"] = (error.get("support") or {}).get("auc")
     return numbers
 
 

@@ -32,10 +32,11 @@ def draw(path: Path, summaries: Sequence[Summary]) -> None:
     """Write an SVG: error, and difference from held-out views, against seconds after the cameras are known.
 
     A colour for each case, a marker for each preset. Filled and joined is the Pareto front of a case; hollow
-    is what a preset of the same case beats in both.
+    is what a preset of the same case beats in both. Dots on a dashed line are a preset's runs with a budget,
+    in order of time; they take no part in the front.
     """
     with matplotlib.rc_context(_STYLE):
-        num_names = len({(summary.case, summary.preset) for summary in summaries})
+        num_names = len({(summary.case, summary.preset, summary.budget_s is None) for summary in summaries})
         num_columns = max(1, math.ceil(num_names / _ROWS_OF_LEGEND))
         figure = Figure(figsize=(9 + 2 * num_columns, 5), layout="constrained")
         left, right = figure.subplots(1, 2)
@@ -59,6 +60,13 @@ def points_of(summaries: Sequence[Summary], number: str) -> tuple[tuple[Summary,
     return tuple(found)
 
 
+def budget_curve(
+    points: Sequence[tuple[Summary, tuple[float, float]]],
+) -> tuple[tuple[float, float], ...]:
+    """The points of those that had a budget, in order of time."""
+    return tuple(sorted(point for summary, point in points if summary.budget_s is not None))
+
+
 def _legend(axes: "Axes") -> dict[str, "Artist"]:
     """Label to what it stands for."""
     handles, labels = axes.get_legend_handles_labels()
@@ -69,7 +77,8 @@ def _panel(axes: "Axes", summaries: Sequence[Summary], number: str) -> None:
     points = points_of(summaries, number)
     presets = list(dict.fromkeys(summary.preset for summary in summaries))
     for index, case in enumerate(dict.fromkeys(summary.case for summary in summaries)):
-        of_case = [(summary.preset, point) for summary, point in points if summary.case == case]
+        mine = [(summary, point) for summary, point in points if summary.case == case]
+        of_case = [(summary.preset, point) for summary, point in mine if summary.budget_s is None]
         front = pareto_front([point for _, point in of_case])
         colour = f"C{index % 10}"
         line = [of_case[place][1] for place in front]
@@ -84,6 +93,12 @@ def _panel(axes: "Axes", summaries: Sequence[Summary], number: str) -> None:
                 linestyle="none",
                 label=f"{case}, {preset}",
             )
+        for preset in presets:
+            curve = budget_curve([pair for pair in mine if pair[0].preset == preset])
+            if curve:
+                seconds, errors = zip(*curve, strict=True)
+                label = f"{case}, {preset}, budgets"
+                axes.plot(seconds, errors, "o--", color=colour, linewidth=0.8, markersize=3, label=label)
     if points:
         axes.set_xscale("log")
         axes.set_yscale("log")

@@ -84,6 +84,11 @@ def image_paths(case: Case, folder: Path, indices: tuple[int, ...]) -> tuple[Pat
     return tuple(images[index] for index in indices)
 
 
+def with_budget(preset: str, budget_s: float | None) -> str:
+    """As tables show it: `balanced`, or `balanced@10s`."""
+    return preset if budget_s is None else f"{preset}@{budget_s:g}s"
+
+
 def _all_images(case: Case, folder: Path) -> list[Path]:
     return sorted(path for path in (folder / case.images).iterdir() if path.suffix.lower() in IMAGE_SUFFIXES)
 

@@ -5,14 +5,16 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from .measuring import Measurement
+from .suites import with_budget
 
 
 @dataclass(frozen=True, kw_only=True)
 class Summary:
-    """A case with a preset, over its seeds; numbers that no run has are missing."""
+    """A case with a preset and a budget, over its seeds; numbers that no run has are missing."""
 
     case: str
     preset: str
+    budget_s: float | None
     num_runs: int
     """Those that gave a mesh."""
     failures: tuple[str, ...]
@@ -44,8 +46,8 @@ COST_COLUMNS = (
 
 
 def error_columns(part: str) -> tuple[Column, ...]:
-    """The errors of the "visible" or the "whole" surface."""
-    return (
+    """The errors of the "visible" or the "whole" surface, and how well support foretells the latter."""
+    columns = (
         Column(heading="Chamfer %", number=f"{part}_chamfer_percent", digits=3),
         Column(heading="accuracy %", number=f"{part}_accuracy_percent", digits=3),
         Column(heading="completeness %", number=f"{part}_completeness_percent", digits=3),
@@ -53,25 +55,29 @@ def error_columns(part: str) -> tuple[Column, ...]:
         Column(heading="F@1%", number=f"{part}_f_score_at_one_percent", digits=3),
         Column(heading="normals", number=f"{part}_normal_consistency", digits=3),
     )
+    support = Column(heading="support AUC", number="support_auc", digits=3)
+    return (*columns, support) if part == "whole" else columns
 
 
 def aggregate(runs: Sequence[Measurement]) -> tuple[Summary, ...]:
-    """One summary for each case and preset, in the order in which they first appear."""
-    groups: dict[tuple[str, str], list[Measurement]] = {}
+    """One summary for each case, preset and budget, in the order in which they first appear."""
+    groups: dict[tuple[str, str, float | None], list[Measurement]] = {}
     for run in runs:
-        groups.setdefault((run.case, run.preset), []).append(run)
-    return tuple(_summary(case, preset, group) for (case, preset), group in groups.items())
+        groups.setdefault((run.case, run.preset, run.budget_s), []).append(run)
+    return tuple(_summary(group) for group in groups.values())
 
 
-def _summary(case: str, preset: str, runs: Sequence[Measurement]) -> Summary:
+def _summary(runs: Sequence[Measurement]) -> Summary:
+    """Of runs that differ in their seed alone."""
     known: dict[str, list[float]] = {}
     for run in runs:
         for name, value in run.numbers.items():
             if value is not None:
                 known.setdefault(name, []).append(value)
     return Summary(
-        case=case,
-        preset=preset,
+        case=runs[0].case,
+        preset=runs[0].preset,
+        budget_s=runs[0].budget_s,
         num_runs=sum(bool(run.numbers) for run in runs),
         failures=tuple(run.failure for run in runs if run.failure is not None),
         median={name: statistics.median(values) for name, values in known.items()},
@@ -99,7 +105,11 @@ def table(summaries: Sequence[Summary], columns: Sequence[Column]) -> str:
     """A Markdown table with a row for each summary: the median, and after ± half the range over the seeds."""
     headings = ["case", "preset", *(column.heading for column in columns)]
     rows = [
-        [summary.case, summary.preset, *(_cell(summary, column) for column in columns)]
+        [
+            summary.case,
+            with_budget(summary.preset, summary.budget_s),
+            *(_cell(summary, column) for column in columns),
+        ]
         for summary in summaries
     ]
     return "\n".join([_row(headings), "|" + "---|" * len(headings), *map(_row, rows)]) + "\n"

@@ -10,6 +10,7 @@ from pathlib import Path
 from ..machine import available_devices, usable_cores
 from . import plot
 from .measuring import Measurement
+from .suites import with_budget
 from .summary import COST_COLUMNS, Summary, aggregate, error_columns, table
 
 _SPREAD = "Medians over the seeds, and after ± half the distance from the lowest to the highest."
@@ -50,7 +51,11 @@ def tables(summaries: Sequence[Summary]) -> str:
         "Error of the visible part:\n\n" + table(summaries, error_columns("visible")),
         "Error of the whole surface:\n\n" + table(summaries, error_columns("whole")),
     ]
-    failures = [f"- {s.case}, {s.preset}: {failure}\n" for s in summaries for failure in s.failures]
+    failures = [
+        f"- {s.case}, {with_budget(s.preset, s.budget_s)}: {failure}\n"
+        for s in summaries
+        for failure in s.failures
+    ]
     if failures:
         parts.append("Failures:\n\n" + "".join(failures))
     return "\n".join(parts)

@@ -1,12 +1,14 @@
 """The command that measures speed against error over a suite of cases."""
 
 import argparse
+import math
 import sys
 from collections.abc import Sequence
+from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ..benchmark.suites import SUITES, Found, find_cases
+from ..benchmark.suites import SUITES, Found, find_cases, with_budget
 from ..errors import ErrorCode, ReconstructionError
 from ..wire.client import backend_command
 from ..wire.protocol import DEVICES, PRESETS
@@ -26,6 +28,14 @@ def add_benchmark(parser: argparse.ArgumentParser) -> None:
     add("--photos", metavar="DIR", type=Path, help="the sets of real photographs")
     add("--presets", nargs="+", choices=PRESETS, default=["fast", "balanced"])
     add("--seeds", type=_count, metavar="N", default=3, help="how often to run everything (3)")
+    add(
+        "--budgets",
+        nargs="+",
+        type=positive_seconds,
+        metavar="S",
+        default=[],
+        help="run each preset also with these times for fitting the surface",
+    )
     add("--device", choices=DEVICES, default="auto", help="where to compute (auto)")
 
 
@@ -54,6 +64,7 @@ def _measure_all(parsed: argparse.Namespace, program: tuple[str, ...], request: 
     about = {
         "suite": parsed.suite,
         "presets": parsed.presets,
+        "budgets_s": parsed.budgets,
         "seeds": list(range(parsed.seeds)),
         "device": parsed.device,
         "machine": machine_facts(),
@@ -63,13 +74,14 @@ def _measure_all(parsed: argparse.Namespace, program: tuple[str, ...], request: 
         _say(f"Left out, because their files are not there: {', '.join(found.missing)}")
     runs: list[Measurement] = []
     for case, folder in found.cases:
-        for preset in parsed.presets:
-            for seed in range(parsed.seeds):
-                trial = Trial(case=case, folder=folder, preset=preset, seed=seed, device=parsed.device)
-                output = parsed.output / "runs" / f"{case.name}-{preset}-{seed}"
-                runs.append(measure(trial, output, program=program, request=request))
-                _say(_line(runs[-1]))
-                write_results(parsed.output, about, runs)
+        for preset, budget_s, seed in product(parsed.presets, [None, *parsed.budgets], range(parsed.seeds)):
+            trial = Trial(
+                case=case, folder=folder, preset=preset, seed=seed, device=parsed.device, budget_s=budget_s
+            )
+            output = parsed.output / "runs" / f"{case.name}-{with_budget(preset, budget_s)}-{seed}"
+            runs.append(measure(trial, output, program=program, request=request))
+            _say(_line(runs[-1]))
+            write_results(parsed.output, about, runs)
     sys.stdout.write(f"{parsed.output / 'table.md'}\n")
 
 
@@ -93,7 +105,7 @@ def _check(parsed: argparse.Namespace, found: Found) -> None:
 
 def _line(run: "Measurement") -> str:
     """A run in a line for a person who waits."""
-    name = f"{run.case}, {run.preset}, seed {run.seed}"
+    name = f"{run.case}, {with_budget(run.preset, run.budget_s)}, seed {run.seed}"
     if run.failure is not None:
         return f"{name}: {run.failure}"
     words = [f"{run.numbers['after_cameras_s']:.1f} s after the cameras"]
@@ -109,6 +121,14 @@ def _line(run: "Measurement") -> str:
 
 def _say(text: str) -> None:
     sys.stderr.write(text + "\n")
+
+
+def positive_seconds(text: str) -> float:
+    """A budget of the command line; ValueError or ArgumentTypeError where it is none."""
+    seconds = float(text)
+    if not 0 < seconds < math.inf:
+        raise argparse.ArgumentTypeError("must be a positive number")
+    return seconds
 
 
 def _count(text: str) -> int:

@@ -130,10 +130,11 @@ def resolve(job: protocol.Job, base: Path) -> "Job":
 
 
 def settings_of(job: protocol.Job) -> "Settings":
-    """The preset's settings, with the job's region where it names one."""
+    """The preset's settings, with the job's budget, and its region where it names one."""
     from ..presets import PRESETS
 
     settings = PRESETS[job.preset]
+    settings = replace(settings, train=replace(settings.train, budget_s=job.budget_s))
     if job.region_centre is None or job.region_radius is None:
         return settings
     x, y, z = job.region_centre

@@ -4,9 +4,12 @@ w(u, v) = 1 / z.  For the plane n . X = 1 in camera axes, w = n_x x + n_y y + n_
 x = (u - cx) / fx, y = (v - cy) / fy; so slopes of w give the normal in closed form.
 """
 
+import numpy as np
 import torch
 import torch.nn.functional as F
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Float32, Int, Int64
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 
 from .correlation import window_sum
@@ -78,3 +81,23 @@ def lowest_with_neighbours(
     before, best, after = cost.gather(-1, around).unbind(-1)
     offset = parabola_offset(before, best, after)
     return index, torch.where((index > 0) & (index < last), offset, 0.0)
+
+
+def piece_sizes(
+    measured: Bool[np.ndarray, "height width"],
+    inverse_depth: Float32[np.ndarray, "height width"],
+    largest_jump: float,
+) -> Int64[np.ndarray, "height width"]:
+    """How many measured pixels each is connected with: side by side, depths apart by less than that share."""
+    height, width = measured.shape
+    number = np.arange(height * width).reshape(height, width)
+    pairs = []
+    for one, other in ((np.s_[:, 1:], np.s_[:, :-1]), (np.s_[1:], np.s_[:-1])):
+        apart = np.abs(inverse_depth[one] - inverse_depth[other])
+        joined = measured[one] & measured[other] & (apart < largest_jump * inverse_depth[one])
+        pairs.append((number[one][joined], number[other][joined]))
+    rows, columns = (np.concatenate(side) for side in zip(*pairs, strict=True))
+    links = coo_array((np.ones(len(rows), bool), (rows, columns)), shape=(height * width,) * 2)
+    _, piece = connected_components(links, directed=False)
+    sizes: Int64[np.ndarray, "height width"] = np.bincount(piece)[piece].reshape(height, width)
+    return sizes

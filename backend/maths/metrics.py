@@ -25,7 +25,8 @@ from scipy.spatial import cKDTree
 
 from ..errors import ErrorCode, ReconstructionError
 from ..scene import Camera, SurfaceMesh
-from .raycast import RayCaster, visible_from
+from .calibration import Calibration, calibration
+from .raycast import RayCaster, interpolate, intersect_planes, visible_from
 
 _READ_FAILURES = (
     OSError,
@@ -82,6 +83,8 @@ class ErrorAgainstTruth:
     visible_share_of_truth: float | None
     visible_share_of_mesh: float | None
     truth_diagonal_world: float
+    support: Calibration
+    """How well the mesh's support foretells the error, over the whole surface."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -104,7 +107,7 @@ def surface_error(
 ) -> ErrorAgainstTruth:
     """Error of a mesh with at least one face; repeats to the bit with the same seed."""
     rng = np.random.default_rng(seed)
-    of_mesh = _sample(mesh.vertices, mesh.faces, num_samples, rng)
+    of_mesh, face = _sample(mesh.vertices, mesh.faces, num_samples, rng)
     of_truth = _sample_truth(truth, num_samples, rng)
     visible, share_of_truth, share_of_mesh = None, None, None
     if cameras and truth.faces is not None:
@@ -112,13 +115,15 @@ def surface_error(
         seen_truth = _seen(of_truth, cameras, RayCaster(truth.vertices, truth.faces))
         share_of_mesh, share_of_truth = float(seen_mesh.mean()), float(seen_truth.mean())
         if seen_mesh.any() and seen_truth.any():
-            visible = _compare(of_mesh.where(seen_mesh), of_truth.where(seen_truth), truth.diagonal)
+            visible, _ = _compare(of_mesh.where(seen_mesh), of_truth.where(seen_truth), truth.diagonal)
+    whole, to_truth = _compare(of_mesh, of_truth, truth.diagonal)
     return ErrorAgainstTruth(
-        whole=_compare(of_mesh, of_truth, truth.diagonal),
+        whole=whole,
         visible=visible,
         visible_share_of_truth=share_of_truth,
         visible_share_of_mesh=share_of_mesh,
         truth_diagonal_world=truth.diagonal,
+        support=calibration(_support_at(mesh, of_mesh, face), to_truth * (100 / truth.diagonal)),
     )
 
 
@@ -180,21 +185,32 @@ def _sample(
     faces: Int64[np.ndarray, "faces 3"],
     num_samples: int,
     rng: np.random.Generator,
-) -> _Samples:
-    """Points drawn evenly over the area, with the normals of their faces."""
+) -> tuple[_Samples, Int64[np.ndarray, "samples"]]:
+    """Points drawn evenly over the area, with the normals of their faces; and which faces those are."""
     surface = trimesh.Trimesh(vertices, faces, process=False)
     # Faces without area carry no samples, but trimesh lists no normal for them.
     positions, face = trimesh.sample.sample_surface(surface, num_samples, seed=rng)
     edges = np.diff(vertices[faces[face]], axis=1)
     normals = np.cross(edges[:, 0], edges[:, 1])
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    return _Samples(positions=np.asarray(positions), normals=normals)
+    return _Samples(positions=np.asarray(positions), normals=normals), np.asarray(face, np.int64)
 
 
 def _sample_truth(truth: TrueSurface, num_samples: int, rng: np.random.Generator) -> _Samples:
     if truth.faces is None:
         return _Samples(positions=truth.vertices, normals=None)
-    return _sample(truth.vertices, truth.faces, num_samples, rng)
+    samples, _ = _sample(truth.vertices, truth.faces, num_samples, rng)
+    return samples
+
+
+def _support_at(
+    mesh: SurfaceMesh, samples: _Samples, face: Int64[np.ndarray, "samples"]
+) -> Float32[np.ndarray, "samples"]:
+    assert samples.normals is not None
+    corners = mesh.faces[face]
+    _, weights = intersect_planes(mesh.vertices[corners], samples.positions, samples.normals)
+    # Single precision as at the vertices: where their support is equal, that of the samples ties.
+    return interpolate(mesh.support, corners, weights).astype(np.float32)
 
 
 def _seen(samples: _Samples, cameras: Sequence[Camera], caster: RayCaster) -> Bool[np.ndarray, "samples"]:
@@ -209,7 +225,10 @@ def _nearest(
     return distance, index
 
 
-def _compare(of_mesh: _Samples, of_truth: _Samples, diagonal: float) -> SurfaceError:
+def _compare(
+    of_mesh: _Samples, of_truth: _Samples, diagonal: float
+) -> tuple[SurfaceError, Float64[np.ndarray, "samples"]]:
+    """The error, and the distance of each of the mesh's samples from the truth (world units)."""
     to_truth, truth_index = _nearest(of_mesh.positions, of_truth.positions)
     to_mesh, mesh_index = _nearest(of_truth.positions, of_mesh.positions)
     consistency = None
@@ -217,13 +236,14 @@ def _compare(of_mesh: _Samples, of_truth: _Samples, diagonal: float) -> SurfaceE
         there = (of_mesh.normals * of_truth.normals[truth_index]).sum(1)
         back = (of_truth.normals * of_mesh.normals[mesh_index]).sum(1)
         consistency = float((np.abs(there).mean() + np.abs(back).mean()) / 2)
-    return SurfaceError(
+    error = SurfaceError(
         accuracy_percent=float(to_truth.mean() / diagonal * 100),
         completeness_percent=float(to_mesh.mean() / diagonal * 100),
         f_score_at_half_percent=_f_score(to_truth, to_mesh, 0.005 * diagonal),
         f_score_at_one_percent=_f_score(to_truth, to_mesh, 0.01 * diagonal),
         normal_consistency=consistency,
     )
+    return error, to_truth
 
 
 def _f_score(

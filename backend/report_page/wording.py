@@ -53,6 +53,12 @@ def percent_text(share: float) -> str:
     return f"{share * 100:.0f} %"
 
 
+def hundred_text(share: float) -> str:
+    """A share as so many of 100; all and none are said of nothing less."""
+    count = round(share * 100)
+    return f"{min(max(count, 1), 99) if 0 < share < 1 else count} of 100"
+
+
 def decibel_text(psnr_db: float | None) -> str:
     """A PSNR; a dash where nothing could be compared."""
     if psnr_db is None:

@@ -18,6 +18,7 @@ from ..maths.grid import laplacian_at, read, spacing, splat
 from ..maths.rays import first_crossing, sphere_entry
 from ..maths.volume import blending_weights, log_transmittance, log_transparency
 from ..scene import Progress
+from .deadline import Deadline
 from .field import SurfaceField
 from .measurements import Measurements
 
@@ -81,7 +82,12 @@ def refine(
     config: RenderConfig,
     generator: torch.Generator,
     progress: Progress,
-) -> Float[Tensor, "nodes nodes nodes"]:
+    deadline: Deadline,
+) -> tuple[Float[Tensor, "nodes nodes nodes"], int]:
+    """The field after some steps, and how many: at most `steps`, and none after the deadline.
+
+    Step sizes shrink with the share that is done, of the steps or of the time, whichever ends first.
+    """
     field = SurfaceField(distance, band_cells=4, channels=6, view_dependent=False, generator=generator)
     _colour_from_points(field, scene)
     pixels = _worthy_pixels(scene)
@@ -95,19 +101,23 @@ def refine(
         betas=(0.9, 0.99),
         eps=1e-12,
     )
-    schedule = torch.optim.lr_scheduler.LambdaLR(optimiser, lambda step: 0.1 ** (step / steps))
-    for step in range(steps):
+    began_s = deadline.clock()
+    step, done = 0, 0.0
+    schedule = torch.optim.lr_scheduler.LambdaLR(optimiser, lambda _: 0.1**done)
+    while done < 1:
         if step % 10 == 0:
-            progress(step / steps, f"rendering at {field.nodes}^3, step {step} of {steps}")
+            progress(done, f"rendering at {field.nodes}^3, step {step} of {steps}")
             whole = field.whole()
-        sharpness = 1 / (h * (1.0 - 0.5 * step / steps))
+        sharpness = 1 / (h * (1.0 - 0.5 * done))
         loss = _ray_loss(field, whole, scene, pixels, sharpness, config, generator)
         loss = loss + _point_loss(field, scene, config, generator) + _shape_loss(field, generator)
         optimiser.zero_grad(set_to_none=True)
         torch.autograd.backward(loss)
         optimiser.step()
+        step += 1
+        done = max(step / steps, deadline.share_gone(began_s))
         schedule.step()
-    return field.whole()
+    return field.whole(), step
 
 
 def _colour_from_points(field: SurfaceField, scene: Measurements) -> None:

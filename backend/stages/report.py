@@ -40,6 +40,7 @@ from ..report_page.wording import (
     css_gradient,
     decibel_text,
     duration_text,
+    hundred_text,
     memory_text,
     percent_text,
     stage_text,
@@ -222,6 +223,7 @@ def render_report_html(report: Report) -> str:
         "decibels": decibel_text,
         "duration": duration_text,
         "gradient": css_gradient,
+        "hundred": hundred_text,
         "memory": memory_text,
         "percent": percent_text,
         "stage": stage_text,
@@ -374,6 +376,7 @@ def _error_numbers(error: ErrorAgainstTruth) -> dict[str, object]:
         "visible_share_of_truth": error.visible_share_of_truth,
         "visible_share_of_mesh": error.visible_share_of_mesh,
         "truth_diagonal_world": error.truth_diagonal_world,
+        "support": dataclasses.asdict(error.support),
     }
 
 

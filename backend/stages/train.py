@@ -5,7 +5,8 @@ order), with free space and with the level before (linear_fit); then gradient st
 the photographs (render_fit).
 """
 
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -15,7 +16,8 @@ from torch import Tensor
 
 from ..errors import ErrorCode, ReconstructionError
 from ..maths.grid import refined, spacing
-from ..scene import Decision, Progress, Region, View, to_unit_sphere
+from ..scene import Decision, Progress, Region, View, to_unit_sphere, within
+from .deadline import Clock, GridCost, deadline_after, finest_grid, predicted_s
 from .linear_fit import fit_level, start, widest_angle_deg
 from .measurements import Measurements, measurements
 from .render_fit import RenderConfig, refine
@@ -36,6 +38,9 @@ class TrainConfig:
     smoothness: float = 0.1
     """Weight of the squared Laplacian in the linear fit."""
     render: RenderConfig = field(default_factory=RenderConfig)
+    budget_s: float | None = None
+    """Time for the whole stage; it ends earlier when all else here is done. None for no limit: then the
+    result does not depend on the clock."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -67,48 +72,79 @@ def fit_surface(
     generator: torch.Generator,
     progress: Progress,
     show: ShowSurface = show_nothing,
+    clock: Clock = time.perf_counter,
 ) -> Surface:
     """The distance field that agrees with points, silhouettes and photographs.
 
     `show` gets the field each time the points are fitted on a finer grid, before any steps of rendering.
+    With a budget the coarsest level is always done, and a later one only as fine as is predicted to fit.
     """
+    deadline = deadline_after(config.budget_s, clock)
     progress(0.0, "finding the extent of the surface")
     with torch.no_grad():
         scene = measurements(views, region, region, stereo, device)
+        began_s = clock()
         distance = fit_level(scene, start(scene, COARSEST), config.smoothness)
         frame = _tight_frame(distance, region)
+        costs = [GridCost(nodes=COARSEST, seconds=clock() - began_s)]
         scene = measurements(views, region, frame, stereo, device)
         distance = start(scene, config.levels[0])
     total = sum(config.steps) + 10 * len(config.levels)
-    done = 0
-    for nodes, steps in zip(config.levels, config.steps, strict=True):
+    done, rendered = 0, 0
+    for wanted, steps in zip(config.levels, config.steps, strict=True):
+        nodes = finest_grid(costs, len(distance), wanted, deadline.left_s())
+        if nodes == len(distance) < wanted:
+            break
         progress(done / total, f"fitting points on a grid of {nodes}^3")
+        began_s = clock()
         with torch.no_grad():
             distance = fit_level(scene, refined(distance, nodes), config.smoothness)
         done += 10
         show(Surface(distance=distance.cpu().numpy(), grid_from_world=frame.object_from_world))
+        costs.append(GridCost(nodes=nodes, seconds=clock() - began_s))
         if steps:
-            tell = _within(progress, done / total, (done + steps) / total)
-            distance = refine(scene, distance, steps, config.render, generator, tell)
+            tell = within(progress, done / total, (done + steps) / total)
+            distance, taken = refine(scene, distance, steps, config.render, generator, tell, deadline)
+            rendered += taken
             done += steps
-    return Surface(
-        distance=distance.cpu().numpy(),
-        grid_from_world=frame.object_from_world,
-        decisions=_decisions(scene, frame, config),
-    )
+    made = _decisions(scene, frame, config, nodes=len(distance), rendered=rendered)
+    if config.budget_s is not None:
+        used_s = config.budget_s - deadline.left_s()
+        made = (*made, _of_budget(config.budget_s, used_s, config, costs, rendered))
+    return Surface(distance=distance.cpu().numpy(), grid_from_world=frame.object_from_world, decisions=made)
 
 
-def _decisions(scene: Measurements, frame: Region, config: TrainConfig) -> tuple[Decision, ...]:
+def _of_budget(
+    budget_s: float, used_s: float, config: TrainConfig, costs: Sequence[GridCost], rendered: int
+) -> Decision:
+    """What the time was enough for."""
+    nodes, wanted, steps = costs[-1].nodes, config.levels[-1], sum(config.steps)
+    why = f"{budget_s:g} s given, {used_s:.1f} s used"
+    if nodes < wanted:
+        choice = f"stopped at a grid of {nodes}"
+        why += f"; a grid of {wanted} is predicted to take {predicted_s(costs, wanted):.1f} s"
+    elif rendered < steps:
+        choice = f"rendering stopped after {rendered} of {steps} steps"
+    else:
+        choice = "all that the preset asks for"
+    return Decision(what="budget", choice=choice, because=why)
+
+
+def _decisions(
+    scene: Measurements, frame: Region, config: TrainConfig, *, nodes: int, rendered: int
+) -> tuple[Decision, ...]:
     """What was modelled and what was left out, with the measurement behind it."""
     masks = sum(outline is not None for outline in scene.outlines)
     backdrops = sum(backdrop is not None for backdrop in scene.backdrops)
     angle_deg = widest_angle_deg(scene)
-    cell = spacing(config.levels[-1]) * frame.radius_world
+    cell = spacing(nodes) * frame.radius_world
+    as_asked = nodes == config.levels[-1] and rendered == sum(config.steps)
+    asked = "the preset" if as_asked else "the time given"
     made = [
         Decision(
             what="grid",
-            choice=f"{config.levels[-1]} nodes along each side of a cube around the surface",
-            because=f"the preset; a cell is {cell:.3g} wide in the cameras' units",
+            choice=f"{nodes} nodes along each side of a cube around the surface",
+            because=f"{asked}; a cell is {cell:.3g} wide in the cameras' units",
         ),
         Decision(
             what="silhouettes",
@@ -123,15 +159,11 @@ def _decisions(scene: Measurements, frame: Region, config: TrainConfig) -> tuple
         Decision(what="background", choice="left out", because="rays that miss the subject are not rendered"),
         Decision(
             what="refinement by rendering",
-            choice=f"{sum(config.steps)} steps" if sum(config.steps) else "left out",
-            because="the preset",
+            choice=f"{rendered} steps" if rendered else "left out",
+            because=asked,
         ),
     ]
     return tuple(made)
-
-
-def _within(progress: Progress, first: float, last: float) -> Progress:
-    return lambda fraction, text: progress(first + (last - first) * fraction, text)
 
 
 def _tight_frame(distance: Float[Tensor, "nodes nodes nodes"], region: Region) -> Region:

@@ -54,6 +54,8 @@ class Job:
     region_centre: tuple[float, ...] | None = None
     """Of the sphere to reconstruct, three numbers in the frame of the cameras; None to find it."""
     region_radius: float | None = None
+    budget_s: float | None = None
+    """Time for fitting the surface; None for as long as the preset needs."""
     until: str = "report"
     """The last stage: "cameras" finds cameras and region and ends."""
 
@@ -182,6 +184,8 @@ def decode_job(text: str) -> Job:
             raise ProtocolError(f"job: {name} is {value!r}; known: {', '.join(known)}")
     if not 0 <= job.seed <= LARGEST_SEED:
         raise ProtocolError(f"job: seed is {job.seed}; it must be from 0 to {LARGEST_SEED}")
+    if job.budget_s is not None and job.budget_s <= 0:
+        raise ProtocolError(f"job: budget_s is {job.budget_s}; it must be positive")
     _check_region(job)
     return job
 

@@ -286,6 +286,15 @@ def test_what_depends_on_a_change_is_redone_and_nothing_else(case: Case) -> None
     assert (case.output / "mesh.ply").read_bytes() == mesh  # the seed alone decides
 
 
+def test_another_budget_fits_the_surface_again_and_the_same_does_not(case: Case) -> None:
+    case.run()
+    case.done()
+    case.run("none", "none", "--budget-seconds", "5")
+    assert case.done() == STAGES[4:]
+    case.run("none", "none", "--budget-seconds", "5")
+    assert case.done() == []
+
+
 def test_a_damaged_checkpoint_is_redone(case: Case) -> None:
     case.run()
     case.done()

@@ -101,6 +101,29 @@ def test_everything_is_run_measured_and_written(
     assert said.out.strip() == str(output / "table.md")
 
 
+def test_each_preset_is_run_with_each_budget_too(photos: Path, tmp_path: Path) -> None:
+    output = tmp_path / "out"
+    words = parsed(photos, output, "--seeds", "1", "--presets", "fast", "--budgets", "10", "2.5")
+    assert command.benchmark(words, program=fake_program()) == EXIT_FINE
+    results = json.loads((output / "results.json").read_text())
+    assert results["budgets_s"] == [10.0, 2.5]
+    assert [(run["preset"], run["budget_s"]) for run in results["runs"]] == [
+        ("fast", None),
+        ("fast", 10.0),
+        ("fast", 2.5),
+    ]
+    reports = [json.loads(path.read_text()) for path in sorted((output / "runs").glob("*/report.json"))]
+    assert {report["settings"]["train.budget_s"] for report in reports} == {None, 10.0, 2.5}
+    rows = (output / "table.md").read_text()
+    assert all(f"| toy | {shown} |" in rows for shown in ("fast", "fast@10s", "fast@2.5s"))
+
+
+@pytest.mark.parametrize("word", ["0", "-1", "nan", "inf", "long"])
+def test_a_budget_is_a_positive_number(word: str, photos: Path, tmp_path: Path) -> None:
+    with pytest.raises(SystemExit):
+        parsed(photos, tmp_path / "out", "--budgets", "10", word)
+
+
 def test_a_run_that_fails_is_told_and_the_next_goes_on(photos: Path, tmp_path: Path) -> None:
     output = tmp_path / "out"
     words = parsed(photos, output, "--seeds", "1")

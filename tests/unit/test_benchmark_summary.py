@@ -1,6 +1,7 @@
 """Laws of the Pareto front, of medians and of the table; the plot is an SVG of known parts."""
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -9,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from backend.benchmark.measuring import Measurement
-from backend.benchmark.plot import colour_difference_percent, draw
+from backend.benchmark.plot import budget_curve, colour_difference_percent, draw, points_of
 from backend.benchmark.summary import COST_COLUMNS, Column, aggregate, error_columns, pareto_front, table
 from backend.benchmark.writing import tables
 
@@ -87,6 +88,14 @@ def test_the_table_has_each_case_and_preset_once() -> None:
         assert {line.count("|") for line in lines} == {len(columns) + 3}
 
 
+def test_the_whole_surface_s_table_ends_with_what_support_foretells() -> None:
+    (summary,) = aggregate([run("a", "fast", 0, {"support_auc": 0.8754})])
+    head, _, row = table((summary,), error_columns("whole")).splitlines()
+    assert head.endswith("| support AUC |")
+    assert row.endswith("| 0.875 |")
+    assert "AUC" not in table((summary,), error_columns("visible"))
+
+
 def test_a_cell_shows_the_median_and_half_the_range_in_its_unit() -> None:
     runs = [run("a", "fast", seed, {"bytes": value}) for seed, value in enumerate((1e9, 2e9, 5e9))]
     column = Column(heading="GB", number="bytes", digits=1, scale=1e-9)
@@ -111,6 +120,40 @@ def test_the_plot_names_what_it_shows_and_repeats_to_the_byte(tmp_path: Path) ->
     assert root.tag == f"{SVG}svg"
     words = ["".join(text.itertext()) for text in root.iter(f"{SVG}text")]
     assert [words.count(f"{case}, {preset}") for case in "ab" for preset in ("fast", "balanced")] == [1] * 4
+
+
+def with_budgets(case: str, budgets_s: list[float]) -> list[Measurement]:
+    """The more time the smaller the error; the longest budget needs but half of its time."""
+    return [
+        replace(
+            run(
+                case,
+                "fast",
+                0,
+                {"after_cameras_s": min(budget_s, 20.0), "visible_chamfer_percent": 1 / budget_s},
+            ),
+            budget_s=budget_s,
+        )
+        for budget_s in budgets_s
+    ]
+
+
+def test_budgets_have_rows_of_their_own() -> None:
+    text = table(aggregate([*runs_of(["a"], ["fast"]), *with_budgets("a", [10.0, 2.5])]), COST_COLUMNS)
+    assert [line.split("|")[2].strip() for line in text.splitlines()[2:]] == ["fast", "fast@10s", "fast@2.5s"]
+
+
+def test_a_budget_s_curve_is_in_order_of_time_and_without_the_run_that_had_none() -> None:
+    summaries = aggregate([*runs_of(["a"], ["fast"]), *with_budgets("a", [40.0, 10.0, 2.5])])
+    curve = budget_curve(points_of(summaries, "visible_chamfer_percent"))
+    assert curve == ((2.5, 0.4), (10.0, 0.1), (20.0, 0.025))
+
+
+def test_the_plot_names_the_curve_once(tmp_path: Path) -> None:
+    draw(tmp_path / "plot.svg", aggregate([*runs_of(["a"], ["fast"]), *with_budgets("a", [10.0, 2.5])]))
+    root = ElementTree.parse(tmp_path / "plot.svg").getroot()
+    words = ["".join(text.itertext()) for text in root.iter(f"{SVG}text")]
+    assert [words.count(name) for name in ("a, fast", "a, fast, budgets")] == [1, 1]
 
 
 def test_runs_without_error_or_view_leave_an_empty_plot(tmp_path: Path) -> None:

@@ -7,6 +7,7 @@ import pytest
 
 import backend.__main__ as program
 from backend.commands.install import Plan
+from backend.commands.reconstruct import settings_of
 from backend.wire.protocol import Job
 
 
@@ -35,15 +36,34 @@ def test_without_a_region_it_is_found(jobs: list[Job]) -> None:
         (["photos", "--output", "o", "--region", "1", "2", "nan", "1"], "finite"),
         (["photos", "--output", "o", "--region", "1", "2", "3"], "expected 4"),
         (["job.json", "--region", "1", "2", "3", "4"], "--region stands in the file"),
+        (["job.json", "--budget-seconds", "4"], "--budget-seconds stands in the file"),
     ],
 )
-def test_wrong_regions_end_with_a_sentence(
+def test_wrong_regions_and_double_options_end_with_a_sentence(
     jobs: list[Job], words: list[str], message: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with pytest.raises(SystemExit) as ended:
         program.run(["reconstruct", *words])
     assert ended.value.code == 2
     assert message in capsys.readouterr().err
+    assert not jobs
+
+
+def test_a_budget_is_in_seconds(jobs: list[Job]) -> None:
+    program.run(["reconstruct", "photos", "--output", "o"])
+    program.run(["reconstruct", "photos", "--output", "o", "--budget-seconds", "12.5"])
+    assert [job.budget_s for job in jobs] == [None, 12.5]
+    assert [settings_of(job).train.budget_s for job in jobs] == [None, 12.5]
+
+
+@pytest.mark.parametrize("words", [["0"], ["-3"], ["nan"], ["inf"], ["soon"]])
+def test_wrong_budgets_end_with_a_sentence(
+    jobs: list[Job], words: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as ended:
+        program.run(["reconstruct", "photos", "--output", "o", "--budget-seconds", *words])
+    assert ended.value.code == 2
+    assert "--budget-seconds" in capsys.readouterr().err
     assert not jobs
 
 

@@ -12,6 +12,7 @@ from backend.maths.inverse_depth import (
     lowest_with_neighbours,
     normals_from_planes,
     parabola_offset,
+    piece_sizes,
 )
 
 CPU = torch.device("cpu")
@@ -143,3 +144,30 @@ def test_the_lowest_cost_and_its_offset() -> None:
     assert index.tolist() == [[2, 5], [0, 7], [0, 7]]
     torch.testing.assert_close(offset[0], torch.tensor([0.3, -0.2]))
     assert (offset[1:] == 0).all()  # the first and the last plane have one neighbour
+
+
+# pieces
+
+
+def test_a_piece_ends_where_nothing_is_measured_and_where_depth_jumps() -> None:
+    measured = np.ones((6, 10), bool)
+    measured[:, 3] = False
+    inverse_depth = np.ones((6, 10), np.float32)
+    inverse_depth[:, 8:] = 1.05
+    sizes = piece_sizes(measured, inverse_depth, largest_jump=0.01)
+    np.testing.assert_array_equal(sizes[:, :3], 18)
+    np.testing.assert_array_equal(sizes[:, 3], 1)
+    np.testing.assert_array_equal(sizes[:, 4:8], 24)
+    np.testing.assert_array_equal(sizes[:, 8:], 12)
+
+
+def test_a_slope_is_one_piece() -> None:
+    """Its ends are far apart, its neighbours are not."""
+    slope = np.linspace(1, 2, 200, dtype=np.float32)[None].repeat(4, axis=0)
+    assert (piece_sizes(np.ones_like(slope, bool), slope, largest_jump=0.01) == 800).all()
+
+
+def test_corners_that_touch_are_not_connected() -> None:
+    checkers = np.indices((4, 4)).sum(axis=0) % 2 == 0
+    sizes = piece_sizes(checkers, np.ones((4, 4), np.float32), largest_jump=0.01)
+    assert (sizes == 1).all()

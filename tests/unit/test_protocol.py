@@ -61,7 +61,12 @@ def test_every_message_comes_back(message: Message) -> None:
 @given(any_of(Job), st.sampled_from(protocol.PRESETS), st.sampled_from(protocol.DEVICES))
 def test_every_job_comes_back(job: Job, preset: str, device: str) -> None:
     values = {f.name: getattr(job, f.name) for f in fields(job)}
-    sensible = {"seed": job.seed % 1000, "region_centre": (0.0, 1.5, -2.0), "region_radius": 3.0}
+    sensible = {
+        "seed": job.seed % 1000,
+        "region_centre": (0.0, 1.5, -2.0),
+        "region_radius": 3.0,
+        "budget_s": 2.5,
+    }
     valid = Job(**{**values, **sensible, "preset": preset, "device": device, "until": "cameras"})
     assert decode_job(encode_job(valid)) == valid
 
@@ -161,6 +166,9 @@ def test_another_version_is_named_even_if_its_fields_differ(version: object) -> 
         {"region_centre": [0, 0, 1e300], "region_radius": 1},
         {"region_centre": [0, 0, 0], "region_radius": 0},
         {"region_centre": [0, 0, 0], "region_radius": -1},
+        {"budget_s": 0},
+        {"budget_s": -1},
+        {"budget_s": "1"},
         {"region_centre": [0, 0, "0"], "region_radius": 1},
     ],
 )

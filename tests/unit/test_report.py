@@ -13,6 +13,7 @@ import pytest
 import trimesh
 from PIL import Image
 
+from backend.benchmark import measuring
 from backend.errors import Cancelled, ErrorCode, ReconstructionError
 from backend.maths.raycast import MeshImage, render_mesh
 from backend.report_page import pictures
@@ -21,6 +22,7 @@ from backend.report_page.wording import (
     css_gradient,
     decibel_text,
     duration_text,
+    hundred_text,
     memory_text,
     percent_text,
     stage_text,
@@ -185,6 +187,58 @@ def test_numbers_survive_json_and_say_their_units(measured: Report) -> None:
     assert 0.1 < whole["chamfer_percent"] < 0.75
     assert numbers["error"]["visible"]["chamfer_percent"] > 0
     assert 0 < numbers["error"]["visible_share_of_truth"] < 0.6
+    assert sum(step["share_of_mesh"] for step in numbers["error"]["support"]["steps"]) == pytest.approx(1)
+
+
+@pytest.fixture
+def doubted(tmp_path: Path) -> Report:
+    """The true mesh with support 0.9, and around it the same, a fifth too large, with 0.1."""
+    inputs = with_truth(small_run(wobble=0.0, num_photos=1), tmp_path / "truth.ply", resolution=2)
+    mesh = inputs.mesh
+    there = mesh.vertices * 1.2
+    both = SurfaceMesh(
+        vertices=np.concatenate([mesh.vertices, there]),
+        faces=np.concatenate([mesh.faces, mesh.faces + len(there)]),
+        normals=np.tile(mesh.normals, (2, 1)),
+        colours_srgb=np.tile(mesh.colours_srgb, (2, 1)),
+        support=np.repeat(np.float32([0.9, 0.1]), len(there)),
+    )
+    return build_report(replace(inputs, mesh=both), SMALL, progress=no_progress)
+
+
+def test_how_support_foretells_error_is_in_page_numbers_and_benchmark(doubted: Report) -> None:
+    """The mesh around has 1.44 times the area of the true one, and is near it where ring meets ball."""
+    assert doubted.error is not None
+    auc = doubted.error.support.auc
+    assert auc is not None
+    numbers = json.loads(json.dumps(report_numbers(doubted), allow_nan=False))
+    assert numbers["error"]["support"]["auc"] == auc
+    assert measuring.report_numbers(numbers)["support_auc"] == auc
+    steps = numbers["error"]["support"]["steps"]
+    assert [step["share_of_mesh"] for step in steps] == pytest.approx(
+        [1.44 / 2.44, 0, 0, 0, 1 / 2.44], abs=0.01
+    )
+    words = " ".join(Page(render_report_html(doubted)).words.split())
+    assert f"good surface from bad in {hundred_text(auc)} pairs" in words
+    off, true = steps[0], steps[-1]
+    assert off["median_error_percent"] > 1 > true["median_error_percent"]
+    for ends, step in (("0.0 to 0.2", off), ("0.8 to 1.0", true)):
+        share, within = (percent_text(step[key]) for key in ("share_of_mesh", "share_within_one_percent"))
+        assert f"{ends} {share} {step['median_error_percent']:.3f} % {within}" in words
+    assert "0.2 to 0.4 0 % – –" in words
+
+
+def test_where_support_has_nothing_to_tell_apart_the_page_says_so(measured: Report) -> None:
+    assert measured.error is not None
+    numbers = report_numbers(measured)
+    assert "support_auc" in measuring.report_numbers(numbers)
+    for factor, word in ((1.0, "all"), (9.0, "none")):
+        whole = replace(measured.error.whole, accuracy_percent=0.2 * factor)
+        support = replace(measured.error.support, auc=None)
+        report = replace(measured, error=replace(measured.error, whole=whole, support=support))
+        words = Page(render_report_html(report)).words
+        assert f"{word} of the surface is within 1 %" in words
+        assert "pairs" not in words
 
 
 def test_the_page_needs_nothing_but_itself(measured: Report) -> None:
@@ -360,6 +414,11 @@ def test_settings_of_settings_are_flattened() -> None:
         (percent_text, 0.42, "42 %"),
         (percent_text, 0.9999, "> 99 %"),
         (percent_text, 1.0, "100 %"),
+        (hundred_text, 0.874, "87 of 100"),
+        (hundred_text, 0.999, "99 of 100"),
+        (hundred_text, 1.0, "100 of 100"),
+        (hundred_text, 0.001, "1 of 100"),
+        (hundred_text, 0.0, "0 of 100"),
         (decibel_text, None, "–"),
         (decibel_text, 27.26, "27.3 dB"),
         (decibel_text, float("inf"), "identical"),

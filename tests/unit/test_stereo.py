@@ -9,7 +9,8 @@ import torch
 
 from backend.errors import Cancelled, ErrorCode, ReconstructionError
 from backend.scene import View, no_progress, transform_points
-from backend.stages.stereo import StereoConfig, StereoResult, match_views
+from backend.stages.stereo import StereoResult, match_views
+from backend.stages.stereo_config import StereoConfig
 from tests.synthetic_scene import (
     SIZE,
     Scene,
@@ -69,6 +70,22 @@ def test_depth_maps_are_true() -> None:
 def test_most_of_what_two_photographs_show_is_measured() -> None:
     for found, covered in zip(matched().depth_maps, scene().coverage, strict=True):
         assert (found.depth > 0)[covered].mean() > 0.75
+
+
+def test_surface_that_turns_away_is_grown_from_its_neighbour() -> None:
+    """Wide apart, a sweep of planes that face the camera misses a fifth of what two photographs show."""
+    wide = photographed(arc_cameras(3, 40, 320))
+    swept, grown = (
+        match_views(wide.views, true_region(), config, device=torch.device("cpu"), progress=no_progress)
+        for config in (StereoConfig(growth_rounds=(0, 0, 0)), StereoConfig())
+    )
+    missed = [
+        np.mean([1 - (m.depth > 0)[on].mean() for m, on in zip(found.depth_maps, wide.coverage, strict=True)])
+        for found in (swept, grown)
+    ]
+    assert missed[1] < 0.4 * missed[0]
+    assert missed[1] < 0.08
+    assert np.quantile(errors_percent(grown), 0.95) < 1.1 * np.quantile(errors_percent(swept), 0.95)
 
 
 def test_points_lie_on_the_surface() -> None:

@@ -4,7 +4,9 @@ Grids and photographs are small, so errors are a share of the grid's cells; benc
 gets on photographs of full size.
 """
 
-from functools import cache
+from collections.abc import Callable
+from functools import cache, partial
+from itertools import count
 
 import numpy as np
 import pytest
@@ -14,9 +16,10 @@ from scipy.spatial import cKDTree
 
 from backend.errors import Cancelled
 from backend.maths.raycast import render_mesh
-from backend.scene import Progress, Region, SurfaceMesh, no_progress, transform_points
+from backend.scene import Decision, Progress, Region, SurfaceMesh, no_progress, transform_points
 from backend.stages.mesh import MeshConfig, extract_mesh, level_set, preview_mesh
-from backend.stages.stereo import StereoConfig, StereoResult, match_views
+from backend.stages.stereo import StereoResult, match_views
+from backend.stages.stereo_config import StereoConfig
 from backend.stages.train import ShowSurface, Surface, TrainConfig, fit_surface, show_nothing
 from tests.synthetic_scene import (
     CENTRE,
@@ -258,3 +261,67 @@ def test_the_inside_lies_within_all_masks() -> None:
         at = np.floor(in_camera[:, :2] / in_camera[:, 2:]).astype(int)
         assert view.mask is not None
         assert view.mask[at[:, 1], at[:, 0]].mean() > 0.999
+
+
+# time
+
+
+def ticking(tick_s: float) -> Callable[[], float]:
+    """A clock that is later each time that it is read."""
+    return partial(next, count(0.0, tick_s))
+
+
+def limited(budget_s: float | None, steps: int = 20, tick_s: float = 1.0) -> Surface:
+    """Of levels that all cost one tick of the clock; deterministic."""
+    config = TrainConfig(levels=(16, 24, 32), steps=(0, 0, steps), budget_s=budget_s)
+    torch.use_deterministic_algorithms(True)
+    try:
+        return fit_surface(
+            masked_scene().views,
+            true_region(),
+            masked_stereo(),
+            config,
+            device=torch.device("cpu"),
+            generator=torch.Generator().manual_seed(0),
+            progress=no_progress,
+            clock=ticking(tick_s),
+        )
+    finally:
+        torch.use_deterministic_algorithms(False)
+
+
+def decision_on(surface: Surface, what: str) -> Decision:
+    (found,) = (decision for decision in surface.decisions if decision.what == what)
+    return found
+
+
+def test_the_more_time_the_finer_the_grid_and_the_smaller_the_error() -> None:
+    surfaces = [limited(budget_s, steps=0) for budget_s in (0.5, 9.0, 20.0)]
+    assert [len(surface.distance) for surface in surfaces] == [16, 24, 32]
+    errors = [float(np.median(errors_percent(level_set(surface)[0]))) for surface in surfaces]
+    assert errors == sorted(errors, reverse=True)
+    stopped, _, whole = (decision_on(surface, "budget") for surface in surfaces)
+    assert stopped.choice == "stopped at a grid of 16"
+    assert "0.5 s given" in stopped.because
+    assert "a grid of 32 is predicted to take 2.0 s" in stopped.because
+    assert whole.choice == "all that the preset asks for"
+    assert decision_on(surfaces[0], "grid").because.startswith("the time given")
+    assert decision_on(surfaces[2], "grid").because.startswith("the preset")
+
+
+def test_rendering_stops_at_the_deadline() -> None:
+    """20 s are over after the levels' readings of the clock and some steps, each a reading."""
+    surface = limited(20.0)
+    assert len(surface.distance) == 32
+    choice = decision_on(surface, "budget").choice
+    steps = int(choice.removeprefix("rendering stopped after ").removesuffix(" of 20 steps"))
+    assert 0 < steps < 20
+    assert decision_on(surface, "refinement by rendering").choice == f"{steps} steps"
+    assert np.abs(surface.distance - limited(20.0, steps=0).distance).max() > 0
+
+
+def test_time_enough_changes_nothing_but_the_words() -> None:
+    unlimited, ample = limited(None, tick_s=1e3), limited(1e6)
+    assert ample.distance.tobytes() == unlimited.distance.tobytes()
+    assert ample.decisions[:-1] == unlimited.decisions
+    assert decision_on(ample, "budget").choice == "all that the preset asks for"

@@ -1,0 +1,294 @@
+"""Depth maps in the making: swept where images are small, then refined and grown, finer and finer."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from jaxtyping import Bool, Float, Shaped
+from torch import Tensor
+
+from ..maths.correlation import correlation, window_mean, window_sum
+from ..maths.geometry import (
+    Pinhole,
+    epipolar_map,
+    inside,
+    pixel_centres,
+    project,
+    sample_image,
+    unproject,
+    warp_pixels,
+)
+from ..maths.inverse_depth import fit_planes, lowest_with_neighbours, piece_sizes
+from ..maths.semi_global import aggregate
+from ..scene import Progress, within
+from .stereo_config import StereoConfig
+from .stereo_windows import Window
+
+_LEAST_FOR_A_PLANE = 12
+"""Seeds in a window that make its plane worth continuing."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Map:
+    """A depth map in the making."""
+
+    window: Window
+    inverse_depth: Float[Tensor, "height width"]
+    score: Float[Tensor, "height width"]
+
+
+def depth_maps(
+    pyramids: list[list[Window]], nearby: list[list[int]], config: StereoConfig, progress: Progress
+) -> list[Map]:
+    """A map for each view, at the first size of its pyramid, coarse to fine.
+
+    All views go through a size together, because what two of them agree on is where maps grow from.
+    `nearby` names for each view those it is compared with.
+    """
+    top = max(len(pyramid) for pyramid in pyramids) - 1
+    maps: list[Map] = []
+    for level in range(top, -1, -1):
+        windows = [pyramid[min(level, len(pyramid) - 1)] for pyramid in pyramids]
+        sources = [[windows[n] for n in near] for near in nearby]
+        # a size has four times the pixels of the one before: half of the time is the last one's
+        tell = within(progress, 0.0 if level == top else 0.5 ** (level + 1), 0.5**level)
+        for index, (window, near) in enumerate(zip(windows, sources, strict=True)):
+            tell(0.3 * index / len(windows), f"depth of photograph {index + 1}")
+            if level == top:
+                maps.append(_sweep(window, near, config))
+            elif maps[index].window is not window:
+                maps[index] = _enlarged(maps[index], window)
+            maps[index] = _refined(maps[index], near, [1.0, 0.5], config)
+        rounds = config.growth_rounds[min(level, 2)]
+        maps = _grown_together(maps, sources, nearby, rounds, config, within(tell, 0.3, 1.0))
+    return [_refined(m, near, [0.25, 0.125], config) for m, near in zip(maps, sources, strict=True)]
+
+
+def _grown_together(
+    maps: list[Map],
+    sources: list[list[Window]],
+    nearby: list[list[int]],
+    rounds: int,
+    config: StereoConfig,
+    progress: Progress,
+) -> list[Map]:
+    """Rounds of growth over all views."""
+    for round_ in range(rounds):
+        votes = [agreement(index, maps, nearby, config) for index in range(len(maps))]
+        for index, near in enumerate(sources):
+            progress((round_ + index / len(maps)) / rounds, f"depth of photograph {index + 1}")
+            if near:
+                seeds = (votes[index] > 0) & (maps[index].score > config.growth_correlation)
+                maps[index] = _grown(maps[index], seeds, near, config)
+    return maps
+
+
+def _grown(
+    current: Map, seeds: Bool[Tensor, "height width"], sources: list[Window], config: StereoConfig
+) -> Map:
+    """Off the seeds, the planes of the seeds beside them where the patches agree better so.
+
+    A sweep over planes that face the camera misses surface that turns away from it, and what it puts there
+    is too far off to be refined; but such surface goes on from where its neighbour ends. Propagation of
+    slanted planes as in PatchMatch Stereo (Bleyer, Rhemann & Rother 2011), from pixels that are sure alone.
+    """
+    window, reach = current.window, config.growth_reach_px
+    near, far = _inverse_depth_range(window.camera)
+    radius = config.patch_radius + 1
+    planes = fit_planes(current.inverse_depth, seeds * current.score.clamp(min=0) ** 2, radius)
+    known = window_sum(seeds.float(), radius) >= _LEAST_FOR_A_PLANE
+    hypotheses = []
+    for du, dv in ((0, 0), (reach, 0), (-reach, 0), (0, reach), (0, -reach)):
+        value, slope_u, slope_v = _moved(planes, du, dv)
+        continued = (value - du * slope_u - dv * slope_v).clamp(far, near)
+        hypotheses.append(torch.where(_moved(known, du, dv), continued, current.inverse_depth))
+    score, index = _scores(window, sources, torch.stack(hypotheses), config).max(dim=0)
+    better = ~seeds & (score > current.score)
+    chosen = torch.stack(hypotheses).gather(0, index[None])[0]
+    grown = Map(
+        window=window,
+        inverse_depth=torch.where(better, chosen, current.inverse_depth),
+        score=torch.where(better, score, current.score),
+    )
+    return _refined(grown, sources, [0.5], config)
+
+
+def _moved(
+    values: Shaped[Tensor, "*batch height width"], du: int, dv: int
+) -> Shaped[Tensor, "*batch height width"]:
+    """What is du columns to the right and dv rows below each pixel; images are taken as endless."""
+    return values.roll((-dv, -du), dims=(-2, -1))
+
+
+def _sweep(window: Window, sources: list[Window], config: StereoConfig) -> Map:
+    """Best plane of every pixel after semi-global matching, to a fraction of a step."""
+    if not sources:
+        nothing = torch.zeros_like(window.grey)
+        return Map(window=window, inverse_depth=nothing, score=nothing)
+    near, far = _inverse_depth_range(window.camera)
+    maps = [epipolar_map(source.camera, window.camera) for source in sources]
+    step = min(float(_step_of_one_pixel(window, [m], (near + far) / 2).median()) for m in maps)
+    count = int(np.clip(math.ceil((near - far) / step), 16, config.num_planes)) + 1
+    planes = torch.linspace(far, near, count, device=window.grey.device)
+    chunks = [
+        _scores(window, sources, chunk[:, None, None].expand(-1, *window.grey.shape), config)
+        for chunk in planes.tensor_split(math.ceil(count / 16))
+    ]
+    score = torch.cat(chunks)
+    gradient = window.grey.diff(dim=0, append=window.grey[-1:]).abs()
+    gradient += window.grey.diff(dim=1, append=window.grey[:, -1:]).abs()
+    large_step = 0.3 + 0.7 * torch.exp(-gradient / 0.04)
+    cost = (1 - score).permute(1, 2, 0).contiguous()
+    index, offset = lowest_with_neighbours(aggregate(cost, 0.08, large_step))
+    inverse_depth = planes[index] + offset * (planes[1] - planes[0])
+    best = score.permute(1, 2, 0).gather(-1, index[..., None])[..., 0]
+    return Map(window=window, inverse_depth=inverse_depth, score=best)
+
+
+def _inverse_depth_range(camera: Pinhole) -> tuple[float, float]:
+    """(nearest, farthest) inverse depth of the unit sphere, kept in front of the camera."""
+    middle = float(camera.camera_from_object[2, 3])
+    nearest = max(middle - 1.0, 0.05 * (middle + 1.0), 1e-3)
+    return 1 / nearest, 1 / max(middle + 1.0, 2 * nearest)
+
+
+def _step_of_one_pixel(
+    window: Window, maps: list[tuple[Tensor, Tensor]], inverse_depth: Float[Tensor, "height width"] | float
+) -> Float[Tensor, "height width"]:
+    """The change of inverse depth that moves the match by one pixel in the source where it moves most."""
+    pixels = pixel_centres(window.camera.width, window.camera.height, window.grey.device)
+    w = torch.as_tensor(inverse_depth, device=window.grey.device).expand(window.grey.shape)
+    speed = torch.zeros_like(window.grey)
+    for a, b in maps:
+        here = warp_pixels(a, b, pixels, w[None])[0]
+        there = warp_pixels(a, b, pixels, w[None] * 1.001)[0]
+        speed = torch.maximum(speed, (there - here).norm(dim=-1) / (0.001 * w))
+    return 1 / speed.clamp(min=1e-6)
+
+
+def _scores(
+    window: Window,
+    sources: list[Window],
+    inverse_depth: Float[Tensor, "planes height width"],
+    config: StereoConfig,
+) -> Float[Tensor, "planes height width"]:
+    """Agreement of each pixel's patch with the sources, in [-1, 1].
+
+    A soft maximum over sources: where one of them is hidden behind something, the others decide.
+    """
+    pixels = pixel_centres(window.camera.width, window.camera.height, window.grey.device)
+    per_source = []
+    for source in sources:
+        a, b = epipolar_map(source.camera, window.camera)
+        where = warp_pixels(a, b, pixels, inverse_depth)
+        warped = sample_image(source.grey[None], where)[:, 0]
+        score = correlation(window.patches, warped, max(window.noise, source.noise))
+        seen = inside(where, source.camera.width, source.camera.height)
+        per_source.append(torch.where(seen, score, -1.0))
+    if len(per_source) == 1:
+        return per_source[0]
+    stacked = torch.stack(per_source)
+    return (stacked * torch.softmax(stacked / 0.15, dim=0)).sum(dim=0)
+
+
+def _refined(current: Map, sources: list[Window], steps_px: list[float], config: StereoConfig) -> Map:
+    """Five hypotheses around planes fitted to the map so far, once for each step width."""
+    if not sources:
+        return current
+    window = current.window
+    maps = [epipolar_map(source.camera, window.camera) for source in sources]
+    near, far = _inverse_depth_range(window.camera)
+    offsets = torch.arange(-2, 3, device=window.grey.device)[:, None, None]
+    for step_px in steps_px:
+        middle = _smoothed(current, config.patch_radius)
+        step = step_px * _step_of_one_pixel(window, maps, middle)
+        hypotheses = (middle + offsets * step).clamp(far, near)
+        score = _scores(window, sources, hypotheses, config)
+        best = score.max(dim=0).values
+        index, offset = lowest_with_neighbours(1 - score.permute(1, 2, 0))
+        current = Map(
+            window=window,
+            inverse_depth=(middle + (index - 2 + offset) * step).clamp(far, near),
+            score=best,
+        )
+    return current
+
+
+def _smoothed(current: Map, radius: int) -> Float[Tensor, "height width"]:
+    """Planes fitted to the better half of every neighbourhood; holes are filled from around."""
+    median = _median(current.inverse_depth)
+    weight = current.score.clamp(min=0.01) ** 2 * current.window.subject
+    spread = window_mean((current.inverse_depth - median).abs(), current.window.subject.float(), radius)
+    spread = spread.clamp(min=1e-6)
+    weight = weight * torch.exp(-(((current.inverse_depth - median) / (2 * spread)) ** 2))
+    value = fit_planes(median, weight, radius)[0]
+    return torch.where(window_sum(weight, radius) > 1e-3, value, median)
+
+
+def _median(values: Float[Tensor, "height width"]) -> Float[Tensor, "height width"]:
+    """Median over 3x3."""
+    padded = F.pad(values[None, None], (1, 1, 1, 1), mode="replicate")[0, 0]
+    height, width = values.shape
+    shifted = [padded[r : r + height, c : c + width] for r in range(3) for c in range(3)]
+    return torch.stack(shifted).median(dim=0).values
+
+
+def _enlarged(current: Map, window: Window) -> Map:
+    """The map over the next larger window; sampled at the same places of the scene."""
+    pixels = pixel_centres(window.camera.width, window.camera.height, window.grey.device)
+    small = current.window.camera
+    scale = pixels.new_tensor(
+        [small.width / (window.camera.width // 2 * 2), small.height / (window.camera.height // 2 * 2)]
+    )
+    both = torch.stack([current.inverse_depth, current.score])
+    inverse_depth, score = sample_image(both, (pixels * scale)[None])[0]
+    return Map(window=window, inverse_depth=inverse_depth, score=score)
+
+
+def measured(
+    index: int, maps: list[Map], nearby: list[list[int]], config: StereoConfig
+) -> Float[Tensor, "height width"]:
+    """`agreement` of pixels that lie in a connected piece of surface; a few alone agree by chance."""
+    votes = agreement(index, maps, nearby, config)
+    pieces = piece_sizes(votes.cpu().numpy() > 0, maps[index].inverse_depth.cpu().numpy(), largest_jump=0.01)
+    return torch.where(torch.tensor(pieces, device=votes.device) >= config.min_piece_px, votes, 0.0)
+
+
+def agreement(
+    index: int, maps: list[Map], nearby: list[list[int]], config: StereoConfig
+) -> Float[Tensor, "height width"]:
+    """How many views agree with each pixel's depth (itself counted), 0 where it is not a measurement."""
+    own = maps[index]
+    pixels = pixel_centres(own.window.camera.width, own.window.camera.height, own.window.grey.device)
+    points = unproject(own.window.camera, pixels, 1 / own.inverse_depth.clamp(min=1e-6))
+    votes = torch.ones_like(own.inverse_depth)
+    for other in range(len(maps)):
+        if other == index or (other not in nearby[index] and index not in nearby[other]):
+            continue
+        votes += _confirms(points, pixels, own, maps[other], config)
+    good = own.window.subject & (own.score > config.min_correlation) & (points.norm(dim=-1) < 1.0)
+    return torch.where(good & (votes > 1), votes, 0.0)
+
+
+def _confirms(
+    points: Float[Tensor, "height width 3"],
+    pixels: Float[Tensor, "height width 2"],
+    own: Map,
+    other: Map,
+    config: StereoConfig,
+) -> Bool[Tensor, "height width"]:
+    """True where the other map's point, seen from here, falls on the pixel it came from and has its depth."""
+    seen_at, depth = project(other.window.camera, points)
+    ok = inside(seen_at, other.window.camera.width, other.window.camera.height) & (depth > 0)
+    both = torch.stack([other.inverse_depth, other.score])
+    inverse_depth, score = sample_image(both, seen_at[None])[0]
+    there = unproject(other.window.camera, seen_at, 1 / inverse_depth.clamp(min=1e-6))
+    back_at, back_depth = project(own.window.camera, there)
+    moved = (back_at - pixels).norm(dim=-1)
+    step = 1 / own.inverse_depth.clamp(min=1e-6)
+    relative = (back_depth - step).abs() / step
+    confirmed: Bool[Tensor, "height width"] = ok & (score > config.min_correlation - 0.1)
+    confirmed &= (moved < config.max_reprojection_px) & (relative < 0.01)
+    return confirmed

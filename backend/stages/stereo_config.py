@@ -1,0 +1,33 @@
+"""How hard stereo looks."""
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True, kw_only=True)
+class StereoConfig:
+    """How hard to look."""
+
+    num_sources: int = 3
+    """Photographs that each one is compared with, at most."""
+    coarse_pixels: int = 50_000
+    """Pixels of the window in which all depths are tried."""
+    num_planes: int = 192
+    """Depths tried there, at most."""
+    patch_radius: int = 3
+    """Half width of the patches, in pixels of the size at hand."""
+    min_correlation: float = 0.3
+    """Patches that agree less than this are not measurements."""
+    max_reprojection_px: float = 1.0
+    """How far a point may move when carried to another photograph's depth map and back."""
+    max_points: int = 500_000
+    """Points kept, evenly over all that are measured; depth maps keep every pixel."""
+    growth_rounds: tuple[int, int, int] = (2, 4, 4)
+    """How often maps grow from what is measured, at full size, at half, and at any smaller size."""
+    growth_reach_px: int = 5
+    """How far at a time, in pixels of the size at hand."""
+    growth_correlation: float = 0.5
+    """Patches must agree this well to be grown from: what is hardly measured is not passed on."""
+    min_piece_px: int = 100
+    """Pixels of a connected piece of measured surface, at least; two patches side by side."""
+    noise: float = 1.2 / 255
+    """Standard deviation of sensor and coding noise in a flat patch of a well exposed photograph."""

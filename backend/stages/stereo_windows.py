@@ -1,0 +1,116 @@
+"""What stereo compares: each view's part that shows the region, from full size to small."""
+
+import math
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from ..maths.backdrop import find_backdrop
+from ..maths.correlation import PatchStatistics, patch_statistics, without_local_mean
+from ..maths.geometry import Pinhole, pinhole_in_object, pixel_centres, unproject
+from ..scene import Region, View
+from .stereo_config import StereoConfig
+
+
+@dataclass(frozen=True, kw_only=True)
+class Window:
+    """One view's part that shows the region, at some size."""
+
+    left: int
+    """First column, in pixels of the view."""
+    top: int
+    camera: Pinhole
+    grey: Float[Tensor, "height width"]
+    """Free of its local mean."""
+    patches: PatchStatistics
+    noise: float
+    subject: Bool[Tensor, "height width"]
+
+
+def pyramid(view: View, region: Region, config: StereoConfig, device: torch.device) -> list[Window]:
+    """The view's window at full size, half, quarter, ... until all depths can be tried."""
+    camera = pinhole_in_object(view.camera, region, device)
+    colours = torch.tensor(view.image_srgb, device=device).permute(2, 0, 1)
+    image = colours.mean(dim=0)
+    subject = sees_region(camera)
+    if view.mask is not None:
+        subject &= torch.tensor(view.mask > 0.5, device=device)
+    elif (backdrop := find_backdrop(colours, subject)) is not None:
+        subject &= ~backdrop.empty
+    left, top, width, height = _bounding_box(subject)
+    camera = camera.cropped(left, top, width, height)
+    grey = image[top : top + height, left : left + width]
+    subject = subject[top : top + height, left : left + width]
+    noise = config.noise * _exposure(grey)
+    windows = []
+    while True:
+        flat = without_local_mean(grey, subject.float(), 2 * config.patch_radius)
+        patches = patch_statistics(flat, subject.float(), config.patch_radius)
+        windows.append(
+            Window(
+                noise=noise, left=left, top=top, camera=camera, grey=flat, patches=patches, subject=subject
+            )
+        )
+        if grey.numel() <= config.coarse_pixels or min(grey.shape) < 64:
+            return windows
+        height, width = grey.shape[0] // 2, grey.shape[1] // 2
+        even = grey[: 2 * height, : 2 * width]
+        grey = F.avg_pool2d(even[None], 2)[0]
+        share = F.avg_pool2d(subject[None, : 2 * height, : 2 * width].float(), 2)[0]
+        subject = share > 0
+        camera = camera.cropped(0, 0, 2 * width, 2 * height).scaled(width, height)
+
+
+def _exposure(grey: Float[Tensor, "height width"]) -> float:
+    """1 for a well exposed photograph, less for a dark one, whose noise is darker too."""
+    bright = float(torch.quantile(grey.flatten()[:: max(1, grey.numel() // 100_000)], 0.99))
+    return min(max(bright / 0.5, 0.25), 1.0)
+
+
+def sees_region(camera: Pinhole) -> Bool[Tensor, "height width"]:
+    """Pixels whose ray meets the unit sphere."""
+    pixels = pixel_centres(camera.width, camera.height, camera.intrinsics.device)
+    far = unproject(camera, pixels, torch.ones_like(pixels[..., 0])) - camera.position
+    direction = F.normalize(far, dim=-1)
+    along = -(direction @ camera.position)
+    closest = (camera.position + along[..., None] * direction).norm(dim=-1)
+    meets: Bool[Tensor, "height width"] = (closest < 1.0) & (along > 0)
+    return meets
+
+
+def _bounding_box(subject: Bool[Tensor, "height width"]) -> tuple[int, int, int, int]:
+    """(left, top, width, height) around the pixels that are set, with room for patches; at least 16 px."""
+    height, width = subject.shape
+    rows = torch.nonzero(subject.any(dim=1)).flatten().tolist() or [0, height - 1]
+    columns = torch.nonzero(subject.any(dim=0)).flatten().tolist() or [0, width - 1]
+    top, bottom = max(rows[0] - 8, 0), min(rows[-1] + 9, height)
+    left, right = max(columns[0] - 8, 0), min(columns[-1] + 9, width)
+    return left, top, max(right - left, min(16, width)), max(bottom - top, min(16, height))
+
+
+def neighbours(cameras: list[Pinhole], count: int) -> list[list[int]]:
+    """For each view the others to compare with: similar direction, but not the same place.
+
+    The wish is 5 to 25 degrees seen from the middle of the region; wider pairs are taken where there
+    is nothing nearer, up to 75 degrees.
+    """
+    directions = F.normalize(torch.stack([camera.position for camera in cameras]), dim=-1)
+    cosines = (directions @ directions.T).clamp(-1, 1)
+    angles_deg = torch.rad2deg(torch.arccos(cosines))
+    chosen = []
+    for i in range(len(cameras)):
+        costs = sorted(
+            (_pair_cost(float(angles_deg[i, j])), j)
+            for j in range(len(cameras))
+            if j != i and 0.5 < float(angles_deg[i, j]) < 75
+        )
+        chosen.append([j for _, j in costs[:count]])
+    return chosen
+
+
+def _pair_cost(angle_deg: float) -> float:
+    """Lowest at 12 degrees; twice as bad at half or double that."""
+    return abs(math.log(angle_deg / 12.0))
