@@ -29,13 +29,13 @@ PRESETS = MappingProxyType(
     {
         "fast": Settings(
             photos=PhotosConfig(max_side_px=800),
-            train=TrainConfig(levels=(32, 64, 96), steps=(0, 0, 0)),
+            train=TrainConfig(levels=(32, 64, 96), rounds=(10, 10, 5), steps=(0, 0, 0)),
             mesh=MeshConfig(max_faces=100_000),
         ),
         "balanced": Settings(photos=PhotosConfig(max_side_px=1024)),
         "detailed": Settings(
             photos=PhotosConfig(max_side_px=1600),
-            train=TrainConfig(levels=(32, 64, 128, 192), steps=(0, 0, 0, 200)),
+            train=TrainConfig(levels=(32, 64, 128, 192), rounds=(15, 15, 10, 10), steps=(0, 0, 0, 200)),
             mesh=MeshConfig(max_faces=500_000),
         ),
     }

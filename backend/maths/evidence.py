@@ -8,6 +8,7 @@ photograph sees through it: in front of what was measured there, or off the subj
 from dataclasses import dataclass
 
 import torch
+import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
@@ -50,6 +51,31 @@ def point_distances(
     return PointDistances(
         distance=distance.reshape(shape), weight=torch.where(weight > 1e-3, weight, 0.0).reshape(shape)
     )
+
+
+def merged_points(
+    positions: Float[Tensor, "points 3"],
+    normals: Float[Tensor, "points 3"],
+    confidence: Float[Tensor, "points"],
+    cell: float,
+) -> tuple[Float[Tensor, "merged 3"], Float[Tensor, "merged 3"], Float[Tensor, "merged"]]:
+    """Points that share a cube of side `cell` and face the same way as one: means, and the confidence's sum.
+
+    The same way is the same side of a die, so that the two faces of a thin sheet stay apart.
+    """
+    place = (positions / cell).floor().long()
+    place -= place.amin(dim=0)
+    axis = normals.abs().argmax(dim=-1)
+    side = 2 * axis + (normals.gather(-1, axis[:, None])[:, 0] > 0)
+    size = place.amax(dim=0) + 1
+    key = ((place[:, 0] * size[1] + place[:, 1]) * size[2] + place[:, 2]) * 6 + side
+    cubes, cube_of = torch.unique(key, return_inverse=True)
+    weighted = (
+        torch.cat([positions, normals, torch.ones_like(positions[:, :1])], dim=-1) * confidence[:, None]
+    )
+    sums = positions.new_zeros((len(cubes), 7)).index_add_(0, cube_of, weighted)
+    kept = sums[sums[:, 6] > 0]
+    return kept[:, :3] / kept[:, 6:], F.normalize(kept[:, 3:6], dim=-1), kept[:, 6]
 
 
 def _offsets(first: int, last: int, device: torch.device) -> Int[Tensor, "offsets 3"]:

@@ -1,27 +1,46 @@
 """The linear part of the fit: the smoothest field that agrees with points, silhouettes and free space."""
 
 import math
+from dataclasses import dataclass
 
 import torch
 import torch.nn.functional as F
 from jaxtyping import Bool, Float
+from scipy.spatial import cKDTree
 from torch import Tensor
 
-from ..maths.evidence import off_silhouette, point_distances, seen_through
+from ..maths.evidence import PointDistances, merged_points, off_silhouette, point_distances, seen_through
 from ..maths.geometry import Pinhole, project, ray_directions
 from ..maths.grid import Corners, locate, node_positions, read, spacing, splat
 from ..maths.rays import first_crossing, sphere_entry
 from ..maths.smooth_fit import fit_smooth
 from .measurements import Measurements
+from .rims import rim_points
 
-ROUNDS = 5
-"""How often the fit asks anew which inequalities are broken."""
-CARVE = 4.0
-"""Weight of free space where the field breaks it, beside measurements of about 1."""
-PRIOR = 1e-3
-"""Weight of the level before, at 32 nodes, beside measurements of about 1."""
 LEAST_RADIUS = 0.3
 """Of the ball behind the surface, in half widths of the subject."""
+
+
+_RIM_REACH = 0.2
+"""How far from a measured point a rim is sure, in units of the grid's frame, if depth is not bounded."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class LinearConfig:
+    """Weights beside that of measurements, which is about 1."""
+
+    smoothness: float = 0.1
+    """Of the squared Laplacian."""
+    free_space: float = 4.0
+    """Off silhouettes, where the field says otherwise."""
+    seen_through: float = 0.2
+    """In front of what was measured, where the field says otherwise."""
+    silhouettes: float = 0.2
+    """On rays through the subject that miss the field."""
+    rims: float = 0.1
+    """Where rays through the outline touch the field."""
+    prior: float = 1e-3
+    """Of the level before, at 32 nodes; more than 0."""
 
 
 def start(scene: Measurements, nodes: int) -> Float[Tensor, "nodes nodes nodes"]:
@@ -42,8 +61,7 @@ def _ball_behind(scene: Measurements, nodes: int) -> Float[Tensor, "nodes nodes 
     together = (weight * (scene.positions - mean_p) * (scene.normals - mean_n)).sum()
     widest = _half_width(scene, mean_p)
     explained = float((together / spread.clamp(min=1e-6)).clamp(LEAST_RADIUS * widest, widest))
-    bounded = min(max((widest_angle_deg(scene) - 50) / 40, 0.0), 1.0)
-    radius = explained + bounded * (widest - explained)
+    radius = explained + _depth_is_bounded(scene) * (widest - explained)
     apart = node_positions(nodes, scene.positions.device) - (mean_p - radius * mean_n)
     return (apart.square().sum(dim=-1) - radius * radius) / (2 * radius)
 
@@ -52,6 +70,11 @@ def widest_angle_deg(scene: Measurements) -> float:
     """Largest angle between two cameras, seen from the region's middle."""
     directions = F.normalize(torch.stack([c.position for c in scene.cameras]) - scene.region_centre, dim=-1)
     return math.degrees(math.acos(float((directions @ directions.T).min().clamp(-1, 1))))
+
+
+def _depth_is_bounded(scene: Measurements) -> float:
+    """Whether silhouettes bound the depth: 0 if the photographs are taken from one side, 1 if from many."""
+    return min(max((widest_angle_deg(scene) - 50) / 40, 0.0), 1.0)
 
 
 def _half_width(scene: Measurements, at: Float[Tensor, "3"]) -> float:
@@ -68,7 +91,7 @@ def _half_width(scene: Measurements, at: Float[Tensor, "3"]) -> float:
 
 
 def fit_level(
-    scene: Measurements, before: Float[Tensor, "nodes nodes nodes"], smoothness: float
+    scene: Measurements, before: Float[Tensor, "nodes nodes nodes"], rounds: int, config: LinearConfig
 ) -> Float[Tensor, "nodes nodes nodes"]:
     """The smoothest field near the points' planes that silhouettes allow, else like the level before.
 
@@ -78,25 +101,47 @@ def fit_level(
     """
     nodes = before.shape[0]
     h = spacing(nodes)
-    measured = point_distances(scene.positions, scene.normals, scene.confidence**3, nodes)
+    points = merged_points(scene.positions, scene.normals, scene.confidence**3, h / 2)
+    measured = point_distances(*points, nodes)
     measured_weight = measured.weight.clamp(max=4.0)
     ball = _ball_behind(scene, nodes)
     outside = _free_distance(scene, nodes)
     through = _seen_through_any(scene, nodes, 3 * h)
     missed = torch.zeros((nodes**3, 1), device=before.device)
     distance = before
-    for _ in range(ROUNDS):
-        target, weight = before.clone(), torch.full_like(before, PRIOR * (32 / nodes) ** 2)
+    for _ in range(rounds):
+        target, weight = before.clone(), torch.full_like(before, config.prior * (32 / nodes) ** 2)
         carved = distance < outside
-        target[carved], weight[carved] = outside[carved], CARVE
+        target[carved], weight[carved] = outside[carved], config.free_space
         carved = through & (distance < 2 * h)
-        target[carved], weight[carved] = 2 * h, 0.2
+        target[carved], weight[carved] = 2 * h, config.seen_through
         missed += splat(*_missed_silhouettes(scene, distance), nodes)
-        pull = 0.2 * missed.reshape(distance.shape).clamp(max=1.0) * (outside < 0)
-        total = weight + measured_weight + pull
-        target = (weight * target + measured_weight * measured.distance - pull * h) / total
-        distance = ball + fit_smooth(target - ball, total, distance - ball, smoothness=smoothness, steps=30)
+        pull = config.silhouettes * missed.reshape(distance.shape).clamp(max=1.0) * (outside < 0)
+        rims = _rim_distances(scene, distance, points[0], config.rims)
+        rim_weight = rims.weight.clamp(max=2.0)
+        total = weight + measured_weight + pull + rim_weight
+        target = weight * target + measured_weight * measured.distance - pull * h + rim_weight * rims.distance
+        distance = ball + fit_smooth(
+            target / total - ball, total, distance - ball, smoothness=config.smoothness, steps=30
+        )
     return distance
+
+
+def _rim_distances(
+    scene: Measurements,
+    distance: Float[Tensor, "nodes nodes nodes"],
+    measured: Float[Tensor, "measured 3"],
+    weight: float,
+) -> PointDistances:
+    """What the rims say of the nodes around them; less, the farther they are from what was measured.
+
+    There only the field's own guess says where a ray touches, unless silhouettes bound the depth.
+    """
+    positions, normals = rim_points(scene, distance)
+    apart, _ = cKDTree(measured.cpu().numpy()).query(positions.cpu().numpy(), workers=-1)
+    apart = torch.tensor(apart, dtype=positions.dtype, device=positions.device)
+    doubt = (1 - _depth_is_bounded(scene)) * (apart / _RIM_REACH).square()
+    return point_distances(positions, normals, weight * torch.exp(-doubt), distance.shape[0])
 
 
 def _missed_silhouettes(

@@ -18,7 +18,7 @@ from ..errors import ErrorCode, ReconstructionError
 from ..maths.grid import refined, spacing
 from ..scene import Decision, Progress, Region, View, to_unit_sphere, within
 from .deadline import Clock, GridCost, deadline_after, finest_grid, predicted_s
-from .linear_fit import fit_level, start, widest_angle_deg
+from .linear_fit import LinearConfig, fit_level, start, widest_angle_deg
 from .measurements import Measurements, measurements
 from .render_fit import RenderConfig, refine
 from .stereo import StereoResult
@@ -35,8 +35,9 @@ class TrainConfig:
     """Nodes along each axis of the grids, coarse to fine."""
     steps: tuple[int, ...] = (0, 0, 100)
     """Gradient steps at each level."""
-    smoothness: float = 0.1
-    """Weight of the squared Laplacian in the linear fit."""
+    rounds: tuple[int, ...] = (15, 15, 10)
+    """How often the linear fit asks at each level which inequalities are broken."""
+    linear: LinearConfig = field(default_factory=LinearConfig)
     render: RenderConfig = field(default_factory=RenderConfig)
     budget_s: float | None = None
     """Time for the whole stage; it ends earlier when all else here is done. None for no limit: then the
@@ -84,21 +85,21 @@ def fit_surface(
     with torch.no_grad():
         scene = measurements(views, region, region, stereo, device)
         began_s = clock()
-        distance = fit_level(scene, start(scene, COARSEST), config.smoothness)
+        distance = fit_level(scene, start(scene, COARSEST), config.rounds[0], config.linear)
         frame = _tight_frame(distance, region)
         costs = [GridCost(nodes=COARSEST, seconds=clock() - began_s)]
         scene = measurements(views, region, frame, stereo, device)
         distance = start(scene, config.levels[0])
     total = sum(config.steps) + 10 * len(config.levels)
     done, rendered = 0, 0
-    for wanted, steps in zip(config.levels, config.steps, strict=True):
+    for wanted, rounds, steps in zip(config.levels, config.rounds, config.steps, strict=True):
         nodes = finest_grid(costs, len(distance), wanted, deadline.left_s())
         if nodes == len(distance) < wanted:
             break
         progress(done / total, f"fitting points on a grid of {nodes}^3")
         began_s = clock()
         with torch.no_grad():
-            distance = fit_level(scene, refined(distance, nodes), config.smoothness)
+            distance = fit_level(scene, refined(distance, nodes), rounds, config.linear)
         done += 10
         show(Surface(distance=distance.cpu().numpy(), grid_from_world=frame.object_from_world))
         costs.append(GridCost(nodes=nodes, seconds=clock() - began_s))

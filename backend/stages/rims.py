@@ -1,0 +1,76 @@
+"""Rims: what a photograph's outline says of the surface that it touches.
+
+A ray through the outline grazes the surface, so it lies in the tangent plane where it touches, and the
+outline gives that plane's normal (Cipolla and Giblin, "Visual Motion of Curves and Surfaces", 2000).
+Where along the ray is not said: it is taken where the field so far is lowest.
+"""
+
+import math
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float
+from torch import Tensor
+
+from ..maths.geometry import Pinhole, ray_directions
+from ..maths.grid import read, spacing
+from .measurements import Measurements
+
+_FARTHEST_CELLS = 6.0
+"""From the field's surface, in cells: a ray that comes no nearer touches something that is not there yet."""
+
+
+def rim_points(
+    scene: Measurements, distance: Float[Tensor, "nodes nodes nodes"]
+) -> tuple[Float[Tensor, "rims 3"], Float[Tensor, "rims 3"]]:
+    """Points where rays touch the surface, about half a cell apart across each view, and unit normals."""
+    h = spacing(distance.shape[0])
+    positions, normals = [scene.positions[:0]], [scene.normals[:0]]
+    for camera, edge, empty in zip(scene.cameras, scene.certain, scene.backdrops, strict=True):
+        if edge is None:
+            continue
+        surely = edge.abs() if empty is None else torch.maximum(edge.abs(), empty.abs() - 1)
+        cell_px = float(h * camera.intrinsics[0, 0] / camera.position.norm())
+        pixels, across = _outline(edge, surely, max(1, round(cell_px / 2)))
+        point, lowest = _lowest_along(camera, pixels, distance)
+        near = lowest.abs() < _FARTHEST_CELLS * h
+        # the line n . p = c of the image is the plane K^T (n, -c) of camera axes through the camera
+        line = torch.cat([across, -(across * pixels).sum(dim=-1, keepdim=True)], dim=-1)
+        normal = F.normalize((line @ camera.intrinsics) @ camera.camera_from_object[:3, :3], dim=-1)
+        positions.append(point[near])
+        normals.append(normal[near])
+    return torch.cat(positions), torch.cat(normals)
+
+
+def _outline(
+    edge: Float[Tensor, "height width"], surely: Float[Tensor, "height width"], step: int
+) -> tuple[Float[Tensor, "rims 2"], Float[Tensor, "rims 2"]]:
+    """Places on an outline to a fraction of a pixel, one for each `step` of them; unit normals, outwards."""
+    smooth = F.avg_pool2d(edge[None], 3, 1, 1, count_include_pad=False)[0]
+    down, right = torch.gradient(smooth)
+    inner = torch.zeros_like(edge, dtype=torch.bool)
+    inner[2:-2, 2:-2] = True  # where a photograph ends is no outline
+    rows, columns = torch.nonzero(inner & (surely < 0.75), as_tuple=True)
+    rows, columns = rows[::step], columns[::step]
+    slope = torch.stack([right[rows, columns], down[rows, columns]], dim=-1)
+    steep = slope.norm(dim=-1)
+    clear = steep > 0.5  # else two outlines meet
+    across = slope[clear] / steep[clear, None]
+    rows, columns = rows[clear], columns[clear]
+    pixels = torch.stack([columns, rows], dim=-1) + 0.5
+    return pixels - across * edge[rows, columns, None], across
+
+
+def _lowest_along(
+    camera: Pinhole, pixels: Float[Tensor, "rims 2"], distance: Float[Tensor, "nodes nodes nodes"]
+) -> tuple[Float[Tensor, "rims 3"], Float[Tensor, "rims"]]:
+    """Where on the rays through pixels the field is lowest inside the cube, and its value there."""
+    directions = F.normalize(ray_directions(camera, pixels), dim=-1)
+    reach = math.sqrt(3.0)
+    count = math.ceil(2 * reach / spacing(distance.shape[0])) + 1
+    along = camera.position.norm() + torch.linspace(-reach, reach, count, device=pixels.device)
+    points = camera.position + along[:, None] * directions[:, None]
+    values = read(distance, points.reshape(-1, 3)).reshape(points.shape[:-1])
+    values = torch.where(points.abs().amax(dim=-1) < 1, values, math.inf)
+    lowest, index = values.min(dim=1)
+    return points[torch.arange(len(index)), index], lowest
