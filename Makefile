@@ -5,7 +5,7 @@ BPY := .venv-blender/bin/python
 BLENDER ?= blender
 DEMO := build/demo
 
-.PHONY: help demo test test-blender check benchmark extension screenshots
+.PHONY: help demo test test-blender check benchmark ablation scaling extension screenshots
 .DELETE_ON_ERROR:
 
 help:
@@ -16,6 +16,8 @@ help:
 	@echo "make test-blender BLENDER=blender   the add-on's tests in a real Blender"
 	@echo "make screenshots BLENDER=blender    the pictures of the add-on in docs/images"
 	@echo "make benchmark SUITE=quick   speed against error: table and plot; also scenes, photos; BUDGETS=\"10 20\""
+	@echo "make ablation CASES=\"monkey_3 plaster_6\"   what each part is worth; SEEDS=3 for medians"
+	@echo "make scaling   how time and memory grow with views, pixels and the grid"
 
 demo: .venv/.ready $(DEMO)/scene/transforms.json
 	$(BACKEND) -m backend reconstruct $(DEMO)/scene/images --cameras $(DEMO)/scene/transforms.json \
@@ -74,6 +76,17 @@ benchmark: .venv/.ready .venv-blender/.ready
 	rm -rf $(BENCHMARK)/$(SUITE)
 	$(BACKEND) -m backend benchmark $(SUITE) --output $(BENCHMARK)/$(SUITE) --seeds $(SEEDS) \
 	    $(if $(BUDGETS),--budgets $(BUDGETS)) --scenes $(BENCHMARK)/scenes $(if $(DATA),--photos $(DATA))
+
+CASES ?= monkey_3 plaster_6
+
+ablation: .venv/.ready .venv-blender/.ready
+	$(BPY) -m benchmarks.render_scenes --cases $(CASES) --output $(BENCHMARK)/scenes $(if $(DATA),--data $(DATA))
+	$(BACKEND) -m benchmarks.ablation --cases $(CASES) --seeds $(SEEDS) --output $(BENCHMARK)/ablation \
+	    --scenes $(BENCHMARK)/scenes $(if $(DATA),--photos $(DATA))
+
+scaling: .venv/.ready .venv-blender/.ready
+	$(BPY) -m benchmarks.render_scenes --cases monkey_12 --output $(BENCHMARK)/scenes
+	$(BACKEND) -m benchmarks.scaling --case monkey_12 --output $(BENCHMARK)/scaling --scenes $(BENCHMARK)/scenes
 
 .venv/.ready: pyproject.toml constraints.txt
 	$(PYTHON) -m venv .venv

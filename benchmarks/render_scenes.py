@@ -1,6 +1,7 @@
 """Renders the scenes of a benchmark's suite that are not there yet; run by Blender's Python.
 
     python -m benchmarks.render_scenes SUITE --output build/benchmark/scenes [--data ../shared/data]
+    python -m benchmarks.render_scenes --cases CASE ... --output build/benchmark/scenes
 
 A scene is rendered again when its options or the sources of blender_scenes have changed. Without --data the
 cases that start from a mesh file are left out.
@@ -13,7 +14,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-from backend.benchmark.suites import SUITES, Case
+from backend.benchmark.suites import CASES, SUITES, Case
 
 ROOT = Path(__file__).resolve().parents[1]
 NOTE = "rendered_from.txt"
@@ -67,12 +68,15 @@ def main() -> int:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("suite", choices=tuple(SUITES))
+    what = parser.add_mutually_exclusive_group(required=True)
+    what.add_argument("suite", nargs="?", choices=tuple(SUITES))
+    what.add_argument("--cases", nargs="+", choices=tuple(CASES), metavar="CASE", help="these instead")
     parser.add_argument("--output", type=Path, required=True)
     parser.add_argument("--data", type=Path, help="folder of mesh files")
     parsed = parser.parse_args()
     logging.basicConfig(level=logging.INFO, format="%(message)s", stream=sys.stderr)
-    cases = tuple(case for case in SUITES[parsed.suite].cases if case.rendering is not None)
+    chosen = [CASES[name] for name in parsed.cases] if parsed.cases else SUITES[parsed.suite].cases
+    cases = tuple(case for case in chosen if case.rendering is not None)
     return render_missing(cases, parsed.output, parsed.data)
 
 

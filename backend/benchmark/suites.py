@@ -169,3 +169,6 @@ SUITES = MappingProxyType(
     }
 )
 """By name."""
+
+CASES = MappingProxyType({case.name: case for suite in SUITES.values() for case in suite.cases})
+"""All of them, by name."""

@@ -101,9 +101,12 @@ def _dominates(one: tuple[float, float], other: tuple[float, float]) -> bool:
     return one[0] <= other[0] and one[1] <= other[1] and one != other
 
 
-def table(summaries: Sequence[Summary], columns: Sequence[Column]) -> str:
-    """A Markdown table with a row for each summary: the median, and after ± half the range over the seeds."""
-    headings = ["case", "preset", *(column.heading for column in columns)]
+def table(summaries: Sequence[Summary], columns: Sequence[Column], *, compared: str = "preset") -> str:
+    """A Markdown table with a row for each summary: the median, and after ± half the range over the seeds.
+
+    `compared` is the heading of what runs of a case differ in.
+    """
+    headings = ["case", compared, *(column.heading for column in columns)]
     rows = [
         [
             summary.case,
@@ -112,6 +115,11 @@ def table(summaries: Sequence[Summary], columns: Sequence[Column]) -> str:
         ]
         for summary in summaries
     ]
+    return markdown(headings, rows)
+
+
+def markdown(headings: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """A Markdown table."""
     return "\n".join([_row(headings), "|" + "---|" * len(headings), *map(_row, rows)]) + "\n"
 
 

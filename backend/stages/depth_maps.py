@@ -39,16 +39,27 @@ class Map:
     score: Float[Tensor, "height width"]
 
 
+@dataclass(frozen=True, kw_only=True)
+class Measured:
+    """A depth map at one size, and what of it is a measurement."""
+
+    map: Map
+    votes: Float[Tensor, "height width"]
+    """How many views agree, the own one counted; 0 where nothing is measured."""
+
+
 def depth_maps(
     pyramids: list[list[Window]], nearby: list[list[int]], config: StereoConfig, progress: Progress
-) -> list[Map]:
-    """A map for each view, at the first size of its pyramid, coarse to fine.
+) -> list[list[Measured]]:
+    """For each view its maps at the sizes of its pyramid, fine to coarse.
 
+    A coarse map tells only what no finer one does: where texture is weak, patches must be large.
     All views go through a size together, because what two of them agree on is where maps grow from.
     `nearby` names for each view those it is compared with.
     """
     top = max(len(pyramid) for pyramid in pyramids) - 1
     maps: list[Map] = []
+    by_size: list[list[Measured]] = []
     for level in range(top, -1, -1):
         windows = [pyramid[min(level, len(pyramid) - 1)] for pyramid in pyramids]
         sources = [[windows[n] for n in near] for near in nearby]
@@ -63,7 +74,23 @@ def depth_maps(
             maps[index] = _refined(maps[index], near, [1.0, 0.5], config)
         rounds = config.growth_rounds[min(level, 2)]
         maps = _grown_together(maps, sources, nearby, rounds, config, within(tell, 0.3, 1.0))
-    return [_refined(m, near, [0.25, 0.125], config) for m, near in zip(maps, sources, strict=True)]
+        sharp = [_refined(m, near, [0.25, 0.125], config) for m, near in zip(maps, sources, strict=True)]
+        votes = [_measured(index, sharp, nearby, config) for index in range(len(sharp))]
+        by_size.insert(0, [Measured(map=m, votes=v) for m, v in zip(sharp, votes, strict=True)])
+    return [_each_once(list(sizes)) for sizes in zip(*by_size, strict=True)]
+
+
+def _each_once(sizes: list[Measured]) -> list[Measured]:
+    """Without what a finer size has measured already."""
+    once, known = [sizes[0]], sizes[0].votes > 0
+    for coarse in sizes[1:]:
+        if coarse.map.window is once[-1].map.window:
+            continue  # the pyramid of another view is higher
+        height, width = coarse.votes.shape
+        known = F.max_pool2d(known[None, : 2 * height, : 2 * width].float(), 2)[0] > 0
+        once.append(Measured(map=coarse.map, votes=torch.where(known, 0.0, coarse.votes)))
+        known = known | (coarse.votes > 0)
+    return once
 
 
 def _grown_together(
@@ -76,7 +103,7 @@ def _grown_together(
 ) -> list[Map]:
     """Rounds of growth over all views."""
     for round_ in range(rounds):
-        votes = [agreement(index, maps, nearby, config) for index in range(len(maps))]
+        votes = [_agreement(index, maps, nearby, config) for index in range(len(maps))]
         for index, near in enumerate(sources):
             progress((round_ + index / len(maps)) / rounds, f"depth of photograph {index + 1}")
             if near:
@@ -247,16 +274,16 @@ def _enlarged(current: Map, window: Window) -> Map:
     return Map(window=window, inverse_depth=inverse_depth, score=score)
 
 
-def measured(
+def _measured(
     index: int, maps: list[Map], nearby: list[list[int]], config: StereoConfig
 ) -> Float[Tensor, "height width"]:
-    """`agreement` of pixels that lie in a connected piece of surface; a few alone agree by chance."""
-    votes = agreement(index, maps, nearby, config)
+    """`_agreement` of pixels that lie in a connected piece of surface; a few alone agree by chance."""
+    votes = _agreement(index, maps, nearby, config)
     pieces = piece_sizes(votes.cpu().numpy() > 0, maps[index].inverse_depth.cpu().numpy(), largest_jump=0.01)
     return torch.where(torch.tensor(pieces, device=votes.device) >= config.min_piece_px, votes, 0.0)
 
 
-def agreement(
+def _agreement(
     index: int, maps: list[Map], nearby: list[list[int]], config: StereoConfig
 ) -> Float[Tensor, "height width"]:
     """How many views agree with each pixel's depth (itself counted), 0 where it is not a measurement."""

@@ -37,8 +37,8 @@ class LinearConfig:
     """In front of what was measured, where the field says otherwise."""
     silhouettes: float = 0.2
     """On rays through the subject that miss the field."""
-    rims: float = 0.1
-    """Where rays through the outline touch the field."""
+    rims: float = 0.2
+    """Where rays through the outline touch the field, if silhouettes bound the depth; else less."""
     prior: float = 1e-3
     """Of the level before, at 32 nodes; more than 0."""
 
@@ -140,7 +140,7 @@ def _rim_distances(
     positions, normals = rim_points(scene, distance)
     apart, _ = cKDTree(measured.cpu().numpy()).query(positions.cpu().numpy(), workers=-1)
     apart = torch.tensor(apart, dtype=positions.dtype, device=positions.device)
-    doubt = (1 - _depth_is_bounded(scene)) * (apart / _RIM_REACH).square()
+    doubt = (1 - _depth_is_bounded(scene)) * (1 + (apart / _RIM_REACH).square())
     return point_distances(positions, normals, weight * torch.exp(-doubt), distance.shape[0])
 
 

@@ -21,7 +21,7 @@ from ..maths.backdrop import find_backdrop
 from ..maths.geometry import pinhole_in_object, pixel_centres, sample_image, unproject
 from ..maths.inverse_depth import fit_planes, normals_from_planes
 from ..scene import Decision, Progress, Region, SurfacePoints, View, within
-from .depth_maps import Map, depth_maps, measured
+from .depth_maps import Measured, depth_maps
 from .stereo_config import StereoConfig
 from .stereo_windows import neighbours, pyramid, sees_region
 
@@ -59,12 +59,10 @@ def match_views(
     with torch.no_grad():
         pyramids = [pyramid(view, region, config, device) for view in views]
         nearby = neighbours([sizes[0].camera for sizes in pyramids], config.num_sources)
-        maps = depth_maps(pyramids, nearby, config, within(progress, 0.0, 0.9))
-        progress(0.9, "comparing depth maps")
-        kept = [measured(index, maps, nearby, config) for index in range(len(maps))]
-        points = _points(views, maps, kept, config.max_points)
+        sizes = depth_maps(pyramids, nearby, config, within(progress, 0.0, 0.95))
+        points = _points(views, sizes, config)
     _check_enough(points)
-    full_size = (_full_size(*each, region) for each in zip(views, maps, kept, strict=True))
+    full_size = (_full_size(view, maps, region, config) for view, maps in zip(views, sizes, strict=True))
     return StereoResult(points=points, depth_maps=tuple(full_size))
 
 
@@ -78,27 +76,14 @@ def _check_enough(points: SurfacePoints) -> None:
         )
 
 
-def _points(views: tuple[View, ...], maps: list[Map], kept: list[Tensor], max_points: int) -> SurfacePoints:
-    stride = max(1, math.ceil(sum(int((votes > 0).sum()) for votes in kept) / max_points))
-    parts: list[list[Tensor]] = []
-    for index, (view, map_, votes) in enumerate(zip(views, maps, kept, strict=True)):
-        camera = map_.window.camera
-        pixels = pixel_centres(camera.width, camera.height, votes.device)
-        mask = votes > 0
-        planes = fit_planes(map_.inverse_depth, mask * map_.score.clamp(min=0) ** 2, 3)
-        normals = normals_from_planes(planes, camera)
-        positions = unproject(camera, pixels, 1 / map_.inverse_depth.clamp(min=1e-6))
-        direction = F.normalize(camera.position - positions, dim=-1)
-        facing = (normals * direction).sum(dim=-1).clamp(min=0)
-        confidence = _confidence(map_, votes) * facing.sqrt()  # grazing views measure worse
-        image = torch.tensor(view.image_srgb, device=votes.device).permute(2, 0, 1)
-        corner = pixels.new_tensor([map_.window.left, map_.window.top])
-        colours = sample_image(image, (pixels + corner)[None])[0].permute(1, 2, 0)
-        mask = mask & (facing > 0.05) & _every(stride, mask)
-        number = torch.full_like(votes, index)
-        parts.append(
-            [positions[mask], normals[mask], colours[mask], confidence[mask], votes[mask], number[mask]]
-        )
+def _points(views: tuple[View, ...], sizes: list[list[Measured]], config: StereoConfig) -> SurfacePoints:
+    found = sum(int((measured.votes > 0).sum()) for maps in sizes for measured in maps)
+    stride = max(1, math.ceil(found / config.max_points))
+    parts = [
+        _points_of_map(index, view, measured, _pixel_size(measured, maps[0]), stride, config)
+        for index, (view, maps) in enumerate(zip(views, sizes, strict=True))
+        for measured in maps
+    ]
     joined = [torch.cat(column).cpu().numpy() for column in zip(*parts, strict=True)]
     return SurfacePoints(
         positions=joined[0],
@@ -110,9 +95,41 @@ def _points(views: tuple[View, ...], maps: list[Map], kept: list[Tensor], max_po
     )
 
 
-def _confidence(map_: Map, votes: Float[Tensor, "height width"]) -> Float[Tensor, "height width"]:
-    """Agreement of the patches; where only two views agree, half as much as where many do."""
-    confidence: Float[Tensor, "height width"] = map_.score.clamp(0, 1) * -torch.expm1(-0.7 * (votes - 1))
+def _points_of_map(
+    index: int, view: View, measured: Measured, pixel_size: float, stride: int, config: StereoConfig
+) -> list[Tensor]:
+    """Positions, normals, colours, confidence, votes, and the view's number."""
+    map_, votes = measured.map, measured.votes
+    camera = map_.window.camera
+    pixels = pixel_centres(camera.width, camera.height, votes.device)
+    mask = votes > 0
+    planes = fit_planes(map_.inverse_depth, mask * map_.score.clamp(min=0) ** 2, 3)
+    normals = normals_from_planes(planes, camera)
+    positions = unproject(camera, pixels, 1 / map_.inverse_depth.clamp(min=1e-6))
+    direction = F.normalize(camera.position - positions, dim=-1)
+    facing = (normals * direction).sum(dim=-1).clamp(min=0)
+    confidence = _confidence(measured, pixel_size, config) * facing.sqrt()  # grazing views measure worse
+    image = torch.tensor(view.image_srgb, device=votes.device).permute(2, 0, 1)
+    corner = pixels.new_tensor([map_.window.left, map_.window.top])
+    colours = sample_image(image, (pixels * pixel_size + corner)[None])[0].permute(1, 2, 0)
+    mask = mask & (facing > 0.05) & _every(stride, mask)
+    number = torch.full_like(votes, index)
+    return [positions[mask], normals[mask], colours[mask], confidence[mask], votes[mask], number[mask]]
+
+
+def _pixel_size(measured: Measured, full: Measured) -> float:
+    """Of a map, in pixels of the photograph."""
+    return float(full.map.window.camera.intrinsics[0, 0] / measured.map.window.camera.intrinsics[0, 0])
+
+
+def _confidence(measured: Measured, pixel_size: float, config: StereoConfig) -> Float[Tensor, "height width"]:
+    """Agreement of the patches; where two views agree, half as much as where many do; less for large pixels.
+
+    0 where nothing is measured.
+    """
+    certain = -torch.expm1(-0.7 * (measured.votes - 1).clamp(min=0))
+    trust: float = config.trust_of_half_size ** math.log2(pixel_size)
+    confidence: Float[Tensor, "height width"] = trust * measured.map.score.clamp(0, 1) * certain
     return confidence
 
 
@@ -122,22 +139,34 @@ def _every(stride: int, mask: Bool[Tensor, "height width"]) -> Bool[Tensor, "hei
     return mask & (number * 7919 % stride == 0)
 
 
-def _full_size(view: View, map_: Map, votes: Float[Tensor, "height width"], region: Region) -> DepthMap:
-    """The window's measurements over the whole photograph."""
+def _full_size(view: View, maps: list[Measured], region: Region, config: StereoConfig) -> DepthMap:
+    """What was measured at any size, over the whole photograph."""
+    window = maps[0].map.window
+    pixels = pixel_centres(window.camera.width, window.camera.height, window.grey.device)
+    inverse_depth, confidence = torch.ones_like(window.grey), torch.zeros_like(window.grey)
+    for measured in reversed(maps):
+        pixel_size = _pixel_size(measured, maps[0])
+        at = (pixels / pixel_size)[None]
+        sure = sample_image(_confidence(measured, pixel_size, config)[None], at, mode="nearest")[0, 0]
+        there = sample_image(measured.map.inverse_depth[None], at)[0, 0]
+        inverse_depth = torch.where(sure > 0, there, inverse_depth)
+        confidence = torch.where(sure > 0, sure, confidence)
     backdrop = None
     if view.mask is None:
-        colours = torch.tensor(view.image_srgb, device=votes.device).permute(2, 0, 1)
-        backdrop = find_backdrop(colours, sees_region(pinhole_in_object(view.camera, region, votes.device)))
-    measured = votes > 0
-    depth = np.zeros((view.camera.height, view.camera.width), np.float32)
-    height, width = votes.shape
-    part = np.s_[map_.window.top : map_.window.top + height, map_.window.left : map_.window.left + width]
-    confidence = np.zeros_like(depth)
-    depth[part] = torch.where(measured, 1 / map_.inverse_depth.clamp(min=1e-6), 0.0).cpu().numpy()
-    confidence[part] = torch.where(measured, _confidence(map_, votes), 0.0).cpu().numpy()
+        colours = torch.tensor(view.image_srgb, device=window.grey.device).permute(2, 0, 1)
+        seen = sees_region(pinhole_in_object(view.camera, region, window.grey.device))
+        backdrop = find_backdrop(colours, seen)
+    whole = np.zeros((2, view.camera.height, view.camera.width), np.float32)
+    known = torch.stack([torch.where(confidence > 0, 1 / inverse_depth.clamp(min=1e-6), 0.0), confidence])
+    rows, columns = (
+        slice(window.top, window.top + len(pixels)),
+        slice(window.left, window.left + pixels.shape[1]),
+    )
+    whole[:, rows, columns] = known.cpu().numpy()
+    depth, confidence_map = whole
     return DepthMap(
         depth=depth,
-        confidence=confidence,
+        confidence=confidence_map,
         # a shadow may be as dark as the backdrop: what was measured is not empty
         empty=None if backdrop is None else backdrop.empty.cpu().numpy() & (depth == 0),
         subject=None if backdrop is None else backdrop.subject.cpu().numpy(),

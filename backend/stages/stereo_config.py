@@ -19,6 +19,8 @@ class StereoConfig:
     """Patches that agree less than this are not measurements."""
     max_reprojection_px: float = 1.0
     """How far a point may move when carried to another photograph's depth map and back."""
+    trust_of_half_size: float = 0.4
+    """Share of its confidence that is left to what only photographs of half the size show."""
     max_points: int = 500_000
     """Points kept, evenly over all that are measured; depth maps keep every pixel."""
     growth_rounds: tuple[int, int, int] = (2, 4, 4)

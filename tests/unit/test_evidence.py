@@ -5,7 +5,13 @@ import pytest
 import torch
 from torch import Tensor
 
-from backend.maths.evidence import off_silhouette, point_distances, read_at_nodes, seen_through
+from backend.maths.evidence import (
+    merged_points,
+    off_silhouette,
+    point_distances,
+    read_at_nodes,
+    seen_through,
+)
 from backend.maths.geometry import Pinhole, inside, project
 from backend.maths.grid import node_positions, spacing
 
@@ -109,6 +115,112 @@ def test_a_confident_point_outweighs_a_doubtful_one() -> None:
     assert result.distance[middle, middle, middle].item() == pytest.approx(
         0.9 * h / 2 - 0.1 * h / 2, rel=1e-4
     )
+
+
+# points as one
+
+
+def oriented_points(num: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Positions in the cube, unit normals of all directions and confidences, some of them 0."""
+    generator = torch.Generator().manual_seed(4)
+    normals = torch.nn.functional.normalize(torch.randn(num, 3, generator=generator), dim=-1)
+    confidence = torch.rand(num, generator=generator)
+    return random_points(num), normals, torch.where(confidence < 0.2, 0.0, confidence)
+
+
+def sorted_rows(positions: Tensor, normals: Tensor, confidence: Tensor) -> Tensor:
+    """All that is known of the points, in an order of their own."""
+    rows = torch.cat([positions, normals, confidence[:, None]], dim=-1).double().numpy()
+    return torch.tensor(rows[np.lexsort(np.round(rows, 4).T)])
+
+
+def merged_one_by_one(positions: Tensor, normals: Tensor, confidence: Tensor, cell: float) -> Tensor:
+    """By a dictionary, point by point, in float64."""
+    sums: dict[tuple[int, ...], np.ndarray] = {}
+    points = (x.double().numpy() for x in (positions, normals, confidence))
+    for p, n, c in zip(*points, strict=True):
+        axis = int(np.abs(n).argmax())
+        key = (*np.floor(p / cell).astype(int).tolist(), axis, bool(n[axis] > 0))
+        sums[key] = sums.get(key, np.zeros(7)) + c * np.array([*p, *n, 1.0])
+    rows = torch.tensor(np.stack([row for row in sums.values() if row[6] > 0]))
+    normal = torch.nn.functional.normalize(rows[:, 3:6], dim=-1)
+    return sorted_rows(rows[:, :3] / rows[:, 6:], normal, rows[:, 6])
+
+
+@pytest.mark.parametrize("cell", [0.07, 0.3, 5.0])
+def test_merged_points_match_the_definition(cell: float) -> None:
+    """A cube of 5 holds an eighth of all: each of its sides is one point."""
+    points = oriented_points(3000)
+    merged = merged_points(*points, cell)
+    torch.testing.assert_close(sorted_rows(*merged), merged_one_by_one(*points, cell), atol=2e-5, rtol=1e-5)
+    assert merged[2].sum().item() == pytest.approx(points[2].sum().item(), rel=1e-5)
+    torch.testing.assert_close(
+        (merged[2][:, None] * merged[0]).sum(dim=0), points[2] @ points[0], atol=1e-4, rtol=0
+    )
+
+
+def test_the_order_of_points_does_not_matter() -> None:
+    points = oriented_points(3000)
+    shuffled = torch.randperm(3000, generator=torch.Generator().manual_seed(5))
+    first = merged_points(*points, 0.2)
+    second = merged_points(*(x[shuffled] for x in points), 0.2)
+    torch.testing.assert_close(sorted_rows(*first), sorted_rows(*second), atol=1e-5, rtol=1e-5)
+
+
+def test_points_without_confidence_leave_no_trace() -> None:
+    positions, normals, confidence = oriented_points(3000)
+    sure = confidence > 0
+    assert 300 < (~sure).sum() < 1000
+    merged = merged_points(positions, normals, confidence, 0.05)
+    alone = merged_points(positions[sure], normals[sure], confidence[sure], 0.05)
+    torch.testing.assert_close(sorted_rows(*merged), sorted_rows(*alone), atol=1e-5, rtol=1e-5)
+    assert all(x.isfinite().all() for x in merged)
+    nothing = merged_points(positions, normals, 0 * confidence, 0.05)
+    assert [len(x) for x in nothing] == [0, 0, 0]
+
+
+def test_the_faces_of_a_thin_sheet_stay_apart() -> None:
+    """A tenth of a cube thick and slightly bent: each cube holds a point of each face, never their mean."""
+    cell = 0.1
+    flat = random_points(4000) * torch.tensor([1.0, 1.0, 0.0]) + torch.tensor([0.0, 0.0, cell / 2])
+    up = torch.nn.functional.normalize(torch.tensor([0.0, 0.0, 1.0]) + 0.2 * random_points(4000), dim=-1)
+    offset = torch.tensor([0.0, 0.0, 0.05 * cell])
+    positions, normals, confidence = merged_points(
+        torch.cat([flat + offset, flat - offset]), torch.cat([up, -up]), torch.ones(8000), cell
+    )
+    upper = normals[:, 2] > 0
+    assert upper.sum() == (~upper).sum() == 400
+    assert normals[:, 2].abs().min() > 0.9
+    torch.testing.assert_close(normals.norm(dim=-1), torch.ones(800))
+    torch.testing.assert_close(positions[upper, 2], torch.full((400,), 0.55 * cell))
+    torch.testing.assert_close(positions[~upper, 2], torch.full((400,), 0.45 * cell))
+    torch.testing.assert_close(confidence.sum(), torch.tensor(8000.0))
+
+
+@pytest.mark.parametrize("curved", [False, True])
+def test_merged_points_say_what_all_points_say(curved: bool) -> None:
+    """Of a plane the same distance, of a ball to second order in the cell; of both the same weight."""
+    nodes, num = 33, 60_000
+    h = spacing(nodes)
+    across = torch.nn.functional.normalize(
+        torch.randn(num, 3, generator=torch.Generator().manual_seed(6)), dim=-1
+    )
+    normal = torch.nn.functional.normalize(torch.tensor([0.5, -0.3, 1.0]), dim=0)
+    spread = random_points(num)
+    flat = spread - ((spread @ normal) - 0.1)[:, None] * normal
+    positions, normals = (0.6 * across, across) if curved else (flat, normal.expand(num, 3))
+    merged = merged_points(positions, normals, torch.ones(num), h / 2)
+    assert len(merged[0]) < num / 4
+    whole = point_distances(positions, normals, torch.ones(num), nodes)
+    few = point_distances(*merged, nodes)
+    near = whole.weight > 0.1 * whole.weight.max()
+    assert near.sum() > 3000
+    apart = (few.distance - whole.distance)[near].abs()
+    assert apart.max() < (h**2 if curved else 1e-4)
+    torch.testing.assert_close(few.weight[near], whole.weight[near], rtol=0.15, atol=0)
+
+
+# nodes in photographs
 
 
 def test_nodes_read_the_image_where_it_shows_them() -> None:

@@ -36,7 +36,7 @@ def test_more_detail_means_larger_pictures_finer_grids_and_more_faces() -> None:
 @pytest.mark.parametrize("name", PRESETS)
 def test_each_level_of_a_preset_has_its_steps(name: str) -> None:
     train = PRESETS[name].train
-    assert len(train.levels) == len(train.steps)
+    assert len(train.levels) == len(train.steps) == len(train.rounds)
     assert list(train.levels) == sorted(set(train.levels))
 
 

@@ -6,6 +6,7 @@ from functools import cache
 import numpy as np
 import pytest
 import torch
+from scipy.ndimage import gaussian_filter
 
 from backend.errors import Cancelled, ErrorCode, ReconstructionError
 from backend.scene import View, no_progress, transform_points
@@ -86,6 +87,33 @@ def test_surface_that_turns_away_is_grown_from_its_neighbour() -> None:
     assert missed[1] < 0.4 * missed[0]
     assert missed[1] < 0.08
     assert np.quantile(errors_percent(grown), 0.95) < 1.1 * np.quantile(errors_percent(swept), 0.95)
+
+
+def test_weak_texture_is_measured_on_smaller_photographs() -> None:
+    """Blurred until a patch shows next to nothing; what larger patches add is right, and trusted less."""
+    wide = photographed(arc_cameras(3, 30, 320))
+    blurred = tuple(
+        replace(view, image_srgb=gaussian_filter(view.image_srgb, (6, 6, 0)) * 0.5) for view in wide.views
+    )
+    results = [
+        match_views(
+            blurred,
+            true_region(),
+            StereoConfig(coarse_pixels=10_000, trust_of_half_size=trust),
+            device=torch.device("cpu"),
+            progress=no_progress,
+        )
+        for trust in (0.0, 0.4)
+    ]
+    maps = list(zip(*(result.depth_maps for result in results), wide.depths, wide.coverage, strict=True))
+    full, both = (np.mean([(m[i].depth > 0)[m[3]].mean() for m in maps]) for i in (0, 1))
+    assert both > full + 0.1
+    for fine, all_sizes, truth, covered in maps:
+        added = (all_sizes.depth > 0) & (fine.depth == 0) & covered
+        apart = 100 * np.abs(all_sizes.depth[added] * OBJECT_UNIT - truth[added]) / diagonal()
+        assert np.median(apart) < 1
+        assert all_sizes.confidence[added].max() <= 0.4
+        np.testing.assert_array_equal(all_sizes.depth[fine.depth > 0], fine.depth[fine.depth > 0])
 
 
 def test_points_lie_on_the_surface() -> None:

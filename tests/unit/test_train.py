@@ -16,7 +16,7 @@ from scipy.spatial import cKDTree
 
 from backend.errors import Cancelled
 from backend.maths.raycast import render_mesh
-from backend.scene import Decision, Progress, Region, SurfaceMesh, no_progress, transform_points
+from backend.scene import Decision, Progress, Region, SurfaceMesh, no_progress, transform_points, within
 from backend.stages.mesh import MeshConfig, extract_mesh, level_set, preview_mesh
 from backend.stages.stereo import StereoResult, match_views
 from backend.stages.stereo_config import StereoConfig
@@ -75,7 +75,7 @@ def masked_stereo() -> StereoResult:
 
 @cache
 def masked_surface() -> Surface:
-    config = TrainConfig(levels=(36,), steps=(5,))
+    config = TrainConfig(levels=(36,), rounds=(5,), steps=(5,))
     return fitted(masked_scene(), true_region(), masked_stereo(), config)
 
 
@@ -103,7 +103,7 @@ def open_stereo() -> StereoResult:
 
 
 def open_surface(seed: int, steps: int = 8) -> Surface:
-    config = TrainConfig(levels=(32,), steps=(steps,))
+    config = TrainConfig(levels=(32,), rounds=(5,), steps=(steps,))
     return fitted(open_scene(), ROOMY, open_stereo(), config, seed)
 
 
@@ -213,7 +213,7 @@ def test_a_seed_repeats_to_the_bit_and_another_one_does_not() -> None:
 def test_unfinished_surfaces_are_shown_and_change_nothing() -> None:
     """One for each level, each nearer to the truth; the last one is what rendering starts from."""
     shown: list[Surface] = []
-    config = TrainConfig(levels=(16, 32), steps=(0, 3))
+    config = TrainConfig(levels=(16, 32), rounds=(5, 5), steps=(0, 3))
     torch.use_deterministic_algorithms(True)
     try:
         seen = fitted(masked_scene(), true_region(), masked_stereo(), config, show=shown.append)
@@ -244,11 +244,20 @@ def test_progress_grows_and_may_cancel() -> None:
         if len(told) == 3:
             raise Cancelled
 
-    config = TrainConfig(levels=(24, 24), steps=(10, 10))
+    config = TrainConfig(levels=(24, 24), rounds=(5, 5), steps=(10, 10))
     with pytest.raises(Cancelled):
         fitted(open_scene(), ROOMY, open_stereo(), config, progress=listen)
     assert told == sorted(told)
     assert 0 <= told[0] < told[-1] < 1
+
+
+def test_progress_of_a_part_is_within_the_whole() -> None:
+    told: list[tuple[float, str]] = []
+    tell = within(lambda fraction, text: told.append((fraction, text)), 0.25, 0.75)
+    for fraction, text in ((0.0, "begun"), (0.5, ""), (1.0, "done")):
+        tell(fraction, text)
+    within(tell, 0.5, 1.0)(0.5, "a part of a part")
+    assert told == [(0.25, "begun"), (0.5, ""), (0.75, "done"), (0.625, "a part of a part")]
 
 
 def test_the_inside_lies_within_all_masks() -> None:
@@ -273,7 +282,7 @@ def ticking(tick_s: float) -> Callable[[], float]:
 
 def limited(budget_s: float | None, steps: int = 20, tick_s: float = 1.0) -> Surface:
     """Of levels that all cost one tick of the clock; deterministic."""
-    config = TrainConfig(levels=(16, 24, 32), steps=(0, 0, steps), budget_s=budget_s)
+    config = TrainConfig(levels=(16, 24, 32), rounds=(5, 5, 5), steps=(0, 0, steps), budget_s=budget_s)
     torch.use_deterministic_algorithms(True)
     try:
         return fit_surface(

@@ -1,0 +1,84 @@
+"""The stages one by one on a case, without a job folder: so one of them can be changed or timed alone."""
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TypeVar
+
+import torch
+
+from ..presets import Settings
+from ..scene import Region, SurfaceMesh, View, no_progress
+from ..stages.cameras import solve_cameras
+from ..stages.mesh import extract_mesh
+from ..stages.photos import load_photos
+from ..stages.region import find_region
+from ..stages.stereo import StereoResult, match_views
+from ..stages.train import ShowSurface, Surface, fit_surface, show_nothing
+from .suites import Case, image_paths
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Placed:
+    """What stereo starts from."""
+
+    views: tuple[View, ...]
+    region: Region
+
+    def without_masks(self) -> "Placed":
+        """The same photographs and the same region, with nothing cut out."""
+        return replace(self, views=tuple(replace(view, mask=None) for view in self.views))
+
+
+def place(case: Case, folder: Path, indices: tuple[int, ...], settings: Settings) -> Placed:
+    """The case's images with these numbers, undistorted, and the region. Raises ReconstructionError."""
+    masks = None if case.masks is None else folder / case.masks
+    cameras = None if case.cameras is None else folder / case.cameras
+    paths = image_paths(case, folder, indices)
+    photos = load_photos(paths, masks, settings.photos, progress=no_progress)
+    with TemporaryDirectory() as scratch:
+        solved = solve_cameras(
+            photos, cameras, settings.cameras, workdir=Path(scratch), seed=0, progress=no_progress
+        )
+    region = find_region(solved, settings.region, progress=no_progress)
+    return Placed(views=solved.views, region=region)
+
+
+def match(placed: Placed, settings: Settings, device: torch.device) -> tuple[StereoResult, float]:
+    """Depth maps and points, and the seconds that they took. Raises ReconstructionError."""
+    work = partial(match_views, placed.views, placed.region, settings.stereo, device=device)
+    return _timed(partial(work, progress=no_progress))
+
+
+def fit(
+    placed: Placed,
+    stereo: StereoResult,
+    settings: Settings,
+    *,
+    seed: int,
+    device: torch.device,
+    show: ShowSurface = show_nothing,
+) -> tuple[Surface, float]:
+    """The field, and the seconds that it took. Raises ReconstructionError."""
+    work = partial(fit_surface, placed.views, placed.region, stereo, settings.train, show=show)
+    generator = torch.Generator(device).manual_seed(seed)
+    return _timed(partial(work, device=device, generator=generator, progress=no_progress))
+
+
+def extract(
+    placed: Placed, stereo: StereoResult, surface: Surface, settings: Settings
+) -> tuple[SurfaceMesh, float]:
+    """The mesh, and the seconds that it took. Raises ReconstructionError."""
+    work = partial(extract_mesh, placed.views, placed.region, stereo, surface, settings.mesh)
+    return _timed(partial(work, progress=no_progress))
+
+
+def _timed(work: Callable[[], T]) -> tuple[T, float]:
+    began_s = time.perf_counter()
+    result = work()
+    return result, time.perf_counter() - began_s

@@ -1,0 +1,88 @@
+"""How time and memory grow with views, pixels and the grid; run by the backend's Python.
+
+    python -m benchmarks.scaling --scenes build/benchmark/scenes --output DIR
+
+Each run has a process of its own, because a process knows only one peak of its memory. Leaves table.md and
+results.json, written anew after every sweep.
+"""
+
+import argparse
+import json
+import logging
+import multiprocessing
+import sys
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import asdict
+from pathlib import Path
+
+from backend.benchmark.scaling import SWEEPS, Cost, Setup, exponents, least, measure, table, verdict
+from backend.benchmark.suites import CASES, Case, Suite, find_cases
+from backend.wire.protocol import DEVICES
+
+logger = logging.getLogger(__name__)
+
+
+def parser() -> argparse.ArgumentParser:
+    """The command's words."""
+    made = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    add = made.add_argument
+    add("--case", choices=tuple(CASES), metavar="CASE", default="monkey_12")
+    add("--scenes", metavar="DIR", type=Path, help="rendered scenes")
+    add("--photos", metavar="DIR", type=Path, help="sets of real photographs")
+    add("--output", metavar="DIR", type=Path, required=True)
+    add("--sweeps", nargs="+", choices=tuple(SWEEPS), default=tuple(SWEEPS))
+    add("--repeats", type=int, metavar="N", default=1, help="the least of N runs counts (1)")
+    add("--device", choices=DEVICES, default="auto", help="where to compute (auto)")
+    return made
+
+
+def main() -> int:
+    """The exit code."""
+    words = parser()
+    parsed = words.parse_args()
+    logging.basicConfig(level=logging.INFO, format="%(message)s", stream=sys.stderr)
+    found = find_cases(Suite(name="chosen", cases=(CASES[parsed.case],)), parsed.scenes, parsed.photos)
+    if found.missing:
+        words.error(f"files are missing of {', '.join(found.missing)}")
+    ((case, folder),) = found.cases
+    parsed.output.mkdir(parents=True, exist_ok=True)
+    done: dict[str, list[Cost]] = {}
+    for sweep in parsed.sweeps:
+        done[sweep] = []
+        for setup in SWEEPS[sweep]:
+            if sweep == "views" and setup.num_views > len(case.given):
+                continue
+            costs = [_measured_alone(case, folder, setup, parsed.device) for _ in range(parsed.repeats)]
+            done[sweep].append(least(costs))
+            logger.info("%s: %s", sweep, done[sweep][-1].sizes[sweep])
+        _write(parsed.output, case, done)
+    sys.stdout.write((parsed.output / "table.md").read_text(encoding="utf-8"))
+    return 0
+
+
+def _measured_alone(case: Case, folder: Path, setup: Setup, device_kind: str) -> Cost:
+    """Measured in a new process, which holds nothing of this one."""
+    with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as pool:
+        return pool.submit(measure, case, folder, setup, device_kind).result()
+
+
+def _write(output: Path, case: Case, done: dict[str, list[Cost]]) -> None:
+    from backend.benchmark.writing import machine_facts  # here: a measured process need not hold matplotlib
+
+    content = {
+        "case": case.name,
+        "machine": machine_facts(),
+        "sweeps": {sweep: [asdict(cost) for cost in costs] for sweep, costs in done.items()},
+        "exponents": {sweep: exponents(sweep, costs) for sweep, costs in done.items()},
+    }
+    (output / "results.json").write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
+    parts = []
+    for sweep, costs in done.items():
+        parts.append(table(sweep, costs))
+        if len(costs) > 1:
+            parts.append(verdict(sweep, costs))
+    (output / "table.md").write_text("\n".join(parts), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    sys.exit(main())
