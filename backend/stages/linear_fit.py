@@ -15,7 +15,7 @@ from ..maths.grid import Corners, locate, node_positions, read, spacing, splat
 from ..maths.rays import first_crossing, sphere_entry
 from ..maths.smooth_fit import fit_smooth
 from .measurements import Measurements
-from .rims import rim_points
+from .rims import RimRays, rim_points, rim_rays
 
 LEAST_RADIUS = 0.3
 """Of the ball behind the surface, in half widths of the subject."""
@@ -108,6 +108,7 @@ def fit_level(
     outside = _free_distance(scene, nodes)
     through = _seen_through_any(scene, nodes, 3 * h)
     missed = torch.zeros((nodes**3, 1), device=before.device)
+    rays, nearest = rim_rays(scene, nodes), cKDTree(points[0].cpu().numpy())
     distance = before
     for _ in range(rounds):
         target, weight = before.clone(), torch.full_like(before, config.prior * (32 / nodes) ** 2)
@@ -117,7 +118,7 @@ def fit_level(
         target[carved], weight[carved] = 2 * h, config.seen_through
         missed += splat(*_missed_silhouettes(scene, distance), nodes)
         pull = config.silhouettes * missed.reshape(distance.shape).clamp(max=1.0) * (outside < 0)
-        rims = _rim_distances(scene, distance, points[0], config.rims)
+        rims = _rim_distances(scene, rays, distance, nearest, config.rims)
         rim_weight = rims.weight.clamp(max=2.0)
         total = weight + measured_weight + pull + rim_weight
         target = weight * target + measured_weight * measured.distance - pull * h + rim_weight * rims.distance
@@ -129,16 +130,17 @@ def fit_level(
 
 def _rim_distances(
     scene: Measurements,
+    rays: RimRays,
     distance: Float[Tensor, "nodes nodes nodes"],
-    measured: Float[Tensor, "measured 3"],
+    measured: cKDTree,
     weight: float,
 ) -> PointDistances:
     """What the rims say of the nodes around them; less, the farther they are from what was measured.
 
     There only the field's own guess says where a ray touches, unless silhouettes bound the depth.
     """
-    positions, normals = rim_points(scene, distance)
-    apart, _ = cKDTree(measured.cpu().numpy()).query(positions.cpu().numpy(), workers=-1)
+    positions, normals = rim_points(rays, distance)
+    apart, _ = measured.query(positions.cpu().numpy(), workers=-1)
     apart = torch.tensor(apart, dtype=positions.dtype, device=positions.device)
     doubt = (1 - _depth_is_bounded(scene)) * (1 + (apart / _RIM_REACH).square())
     return point_distances(positions, normals, weight * torch.exp(-doubt), distance.shape[0])

@@ -6,13 +6,14 @@ Where along the ray is not said: it is taken where the field so far is lowest.
 """
 
 import math
+from dataclasses import dataclass
 
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
-from ..maths.geometry import Pinhole, ray_directions
+from ..maths.geometry import ray_directions
 from ..maths.grid import read, spacing
 from .measurements import Measurements
 
@@ -20,26 +21,50 @@ _FARTHEST_CELLS = 6.0
 """From the field's surface, in cells: a ray that comes no nearer touches something that is not there yet."""
 
 
-def rim_points(
-    scene: Measurements, distance: Float[Tensor, "nodes nodes nodes"]
-) -> tuple[Float[Tensor, "rims 3"], Float[Tensor, "rims 3"]]:
-    """Points where rays touch the surface, about half a cell apart across each view, and unit normals."""
-    h = spacing(distance.shape[0])
-    positions, normals = [scene.positions[:0]], [scene.normals[:0]]
+@dataclass(frozen=True, kw_only=True)
+class RimRays:
+    """Rays that graze the surface; the same at every state of the field."""
+
+    origins: Float[Tensor, "rims 3"]
+    directions: Float[Tensor, "rims 3"]
+    """Unit vectors."""
+    normals: Float[Tensor, "rims 3"]
+    """Of the surface where it is touched; unit vectors, outwards."""
+
+
+def rim_rays(scene: Measurements, nodes: int) -> RimRays:
+    """Rays through the outlines of all views, as many as a grid of so many nodes needs."""
+    parts = [[scene.positions[:0]] * 3]
     for camera, edge, empty in zip(scene.cameras, scene.certain, scene.backdrops, strict=True):
         if edge is None:
             continue
         surely = edge.abs() if empty is None else torch.maximum(edge.abs(), empty.abs() - 1)
-        cell_px = float(h * camera.intrinsics[0, 0] / camera.position.norm())
+        cell_px = float(spacing(nodes) * camera.intrinsics[0, 0] / camera.position.norm())
         pixels, across = _outline(edge, surely, max(1, round(cell_px / 2)))
-        point, lowest = _lowest_along(camera, pixels, distance)
-        near = lowest.abs() < _FARTHEST_CELLS * h
+        directions = F.normalize(ray_directions(camera, pixels), dim=-1)
         # the line n . p = c of the image is the plane K^T (n, -c) of camera axes through the camera
         line = torch.cat([across, -(across * pixels).sum(dim=-1, keepdim=True)], dim=-1)
-        normal = F.normalize((line @ camera.intrinsics) @ camera.camera_from_object[:3, :3], dim=-1)
-        positions.append(point[near])
-        normals.append(normal[near])
-    return torch.cat(positions), torch.cat(normals)
+        normals = F.normalize((line @ camera.intrinsics) @ camera.camera_from_object[:3, :3], dim=-1)
+        parts.append([camera.position.expand_as(directions), directions, normals])
+    origins, directions, normals = (torch.cat(column) for column in zip(*parts, strict=True))
+    return RimRays(origins=origins, directions=directions, normals=normals)
+
+
+def rim_points(
+    rays: RimRays, distance: Float[Tensor, "nodes nodes nodes"]
+) -> tuple[Float[Tensor, "rims 3"], Float[Tensor, "rims 3"]]:
+    """Where rays touch a field: where it is lowest on them, inside the cube; and the normals there."""
+    h = spacing(distance.shape[0])
+    reach = math.sqrt(3.0)
+    count = math.ceil(2 * reach / h) + 1
+    steps = torch.linspace(-reach, reach, count, device=distance.device)
+    along = (rays.origins.norm(dim=-1, keepdim=True) + steps).clamp(min=0)
+    points = rays.origins[:, None] + along[..., None] * rays.directions[:, None]
+    values = read(distance, points.reshape(-1, 3)).reshape(along.shape)
+    values = torch.where(points.abs().amax(dim=-1) < 1, values, math.inf)
+    lowest, index = values.min(dim=1)
+    near = lowest.abs() < _FARTHEST_CELLS * h
+    return points[near, index[near]], rays.normals[near]
 
 
 def _outline(
@@ -61,18 +86,3 @@ def _outline(
     across = F.normalize(slope[rows, columns], dim=-1)
     pixels = torch.stack([columns, rows], dim=-1) + 0.5
     return pixels - across * edge[rows, columns, None], across
-
-
-def _lowest_along(
-    camera: Pinhole, pixels: Float[Tensor, "rims 2"], distance: Float[Tensor, "nodes nodes nodes"]
-) -> tuple[Float[Tensor, "rims 3"], Float[Tensor, "rims"]]:
-    """Where on the rays through pixels the field is lowest inside the cube, and its value there."""
-    directions = F.normalize(ray_directions(camera, pixels), dim=-1)
-    reach = math.sqrt(3.0)
-    count = math.ceil(2 * reach / spacing(distance.shape[0])) + 1
-    along = camera.position.norm() + torch.linspace(-reach, reach, count, device=pixels.device)
-    points = camera.position + along[:, None] * directions[:, None]
-    values = read(distance, points.reshape(-1, 3)).reshape(points.shape[:-1])
-    values = torch.where(points.abs().amax(dim=-1) < 1, values, math.inf)
-    lowest, index = values.min(dim=1)
-    return points[torch.arange(len(index)), index], lowest

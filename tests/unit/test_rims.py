@@ -18,7 +18,7 @@ from backend.maths.grid import locate, node_positions, spacing, value_and_gradie
 from backend.scene import SurfacePoints, transform_points
 from backend.stages.linear_fit import LinearConfig, fit_level, start
 from backend.stages.measurements import Measurements, measurements
-from backend.stages.rims import rim_points
+from backend.stages.rims import rim_points, rim_rays
 from backend.stages.stereo import DepthMap, StereoResult
 from tests.synthetic_scene import (
     DISTANCE,
@@ -151,6 +151,10 @@ def angles_deg(normals: Points, others: Points) -> Float[Tensor, "points"]:
     return torch.rad2deg(torch.acos((normals * others).sum(dim=-1).clamp(-1, 1)))
 
 
+def touched(scene: Measurements, distance: Float[Tensor, "nodes nodes nodes"]) -> tuple[Points, Points]:
+    return rim_points(rim_rays(scene, len(distance)), distance)
+
+
 # where rays touch
 
 
@@ -161,7 +165,7 @@ def angles_deg(normals: Points, others: Points) -> Float[Tensor, "points"]:
 def test_rims_are_where_rays_touch_the_body(camera: Pinhole, nodes: int) -> None:
     cell = spacing(nodes)
     touching = touching_points(camera)
-    positions, normals = rim_points(seen([camera], [exact_edge(camera)]), field(nodes))
+    positions, normals = touched(seen([camera], [exact_edge(camera)]), field(nodes))
     assert distance_to_first_order(positions).abs().max() < cell**2, "of second order"
     apart, off = apart_and_turned(camera, positions, normals)
     assert apart.max() < cell, "along the ray"
@@ -180,7 +184,7 @@ def test_rims_of_masks_lie_on_the_body_but_for_a_pixel() -> None:
     of_masks = measurements(scene.views, region, region, nothing_measured(scene), CPU)
     nodes_world = transform_points(region.world_from_object, node_positions(64, CPU).double().numpy())
     distance = torch.tensor(surface_distance(nodes_world.reshape(-1, 3))) / region.radius_world
-    positions, normals = rim_points(of_masks, distance.reshape(64, 64, 64).float())
+    positions, normals = touched(of_masks, distance.reshape(64, 64, 64).float())
     assert len(positions) > 500
     world = transform_points(region.world_from_object, positions.double().numpy())
     pixel = DISTANCE * SIZE / scene.cameras[0].fx_px
@@ -211,16 +215,16 @@ def test_rims_lie_half_a_cell_apart_or_closer() -> None:
     touching = touching_points(camera)
     length = float((touching - touching.roll(1, 0)).norm(dim=-1).sum())
     for nodes in (12, 16, 21, 41):
-        count = len(rim_points(seen([camera], [exact_edge(camera)]), field(nodes))[0])
+        count = len(touched(seen([camera], [exact_edge(camera)]), field(nodes))[0])
         assert 0.2 * spacing(nodes) < length / count < 0.6 * spacing(nodes)
 
 
 def test_each_photograph_gives_its_own_rims() -> None:
     cameras = [camera_from(20), camera_from(130), camera_from(250)]
     edges = [exact_edge(camera) for camera in cameras]
-    each = [rim_points(seen([c], [e]), field()) for c, e in zip(cameras, edges, strict=True)]
+    each = [touched(seen([c], [e]), field()) for c, e in zip(cameras, edges, strict=True)]
     assert min(len(positions) for positions, _ in each) > 50
-    both = rim_points(seen(cameras, [edges[0], None, edges[2]]), field())
+    both = touched(seen(cameras, [edges[0], None, edges[2]]), field())
     for found, first, last in zip(both, each[0], each[2], strict=True):
         assert (found == torch.cat([first, last])).all()
 
@@ -233,39 +237,39 @@ def test_where_a_photograph_ends_is_no_outline() -> None:
     camera = camera_from(20, aside=2.2)
     edge = exact_edge(camera)
     assert (edge[:, 0] < 0).any(), "is cut"
-    positions, normals = rim_points(seen([camera], [edge]), field())
+    positions, normals = touched(seen([camera], [edge]), field())
     apart, off = apart_and_turned(camera, positions, normals)
     assert len(positions) > 30
     assert apart.max() < CELL
     assert off.max() < 0.5
     frame = torch.full((HEIGHT, WIDTH), -0.5)
     frame[0], frame[-1], frame[:, 0], frame[:, -1] = 0.5, 0.5, 0.5, 0.5
-    assert not len(rim_points(seen([camera_from(20)], [frame]), field() * 0)[0])
+    assert not len(touched(seen([camera_from(20)], [frame]), field() * 0)[0])
 
 
 def test_a_field_that_rays_do_not_come_near_has_no_rims() -> None:
     """Within six cells: rims are where the body that is so much too large or small is deepest."""
     scene = seen([camera_from(20)], [exact_edge(camera_from(20))])
-    as_large = rim_points(scene, field())[0]
+    as_large = touched(scene, field())[0]
     for more in (5.5 * CELL, -4.5 * CELL):
-        moved = (rim_points(scene, field() + more)[0] - as_large).norm(dim=-1)
+        moved = (touched(scene, field() + more)[0] - as_large).norm(dim=-1)
         assert moved.median() == 0
         assert moved.max() < 2 * CELL, "where two places are as deep"
-    positions, normals = rim_points(scene, field() + 6.5 * CELL)
+    positions, normals = touched(scene, field() + 6.5 * CELL)
     assert positions.shape == normals.shape == (0, 3)
 
 
 def test_rims_lie_in_the_grid_s_cube() -> None:
     """Of a field that says nothing; beyond the cube it is not known. Rays that miss the cube give none."""
     edge = (torch.arange(WIDTH) - 50.5).expand(HEIGHT, WIDTH)
-    positions, _ = rim_points(seen([camera_from(20)], [edge]), field() * 0)
+    positions, _ = touched(seen([camera_from(20)], [edge]), field() * 0)
     assert len(positions) > 30
     assert positions.abs().max() < 1
-    assert not len(rim_points(seen([camera_from(20, aside=-4)], [edge + 40]), field() * 0)[0])
+    assert not len(touched(seen([camera_from(20, aside=-4)], [edge + 40]), field() * 0)[0])
 
 
 def test_without_outlines_there_are_no_rims() -> None:
-    positions, normals = rim_points(seen([camera_from(20)], [None]), field())
+    positions, normals = touched(seen([camera_from(20)], [None]), field())
     assert positions.shape == normals.shape == (0, 3)
 
 
@@ -273,24 +277,24 @@ def test_an_edge_is_an_outline_only_where_it_meets_the_backdrop() -> None:
     """On the right the backdrop begins where the body ends, on the left four pixels off."""
     camera = camera_from(20)
     edge = exact_edge(camera)
-    positions, _ = rim_points(seen([camera], [edge]), field())
+    positions, _ = touched(seen([camera], [edge]), field())
     columns = project(camera, positions)[0][:, 0]
     middle = float(columns.mean())
     apart = edge.clone()
     apart[:, : round(middle)] -= 4
-    found = rim_points(seen([camera], [edge], [apart]), field())[0]
+    found = touched(seen([camera], [edge], [apart]), field())[0]
     right = project(camera, found)[0][:, 0]
     assert right.min() > middle - 2
     assert len(found) == pytest.approx((columns > middle).sum(), abs=3)
-    assert not len(rim_points(seen([camera], [edge], [edge - 4]), field())[0])
+    assert not len(touched(seen([camera], [edge], [edge - 4]), field())[0])
 
 
 def test_a_wire_of_a_pixel_has_no_rims_a_strip_has_two() -> None:
     """Where two outlines meet, the distance has no slope that tells which way is out."""
     camera = camera_from(20)
     apart = (torch.arange(WIDTH) - 150).abs().float().expand(HEIGHT, WIDTH)
-    assert not len(rim_points(seen([camera], [apart - 0.5]), field() * 0)[0])
-    positions, normals = rim_points(seen([camera], [apart - 4.5]), field() * 0)
+    assert not len(touched(seen([camera], [apart - 0.5]), field() * 0)[0])
+    positions, normals = touched(seen([camera], [apart - 4.5]), field() * 0)
     columns = project(camera, positions)[0][:, 0]
     rightwards = normals @ camera.camera_from_object[0, :3]
     left, right = (columns - 146).abs() < 0.01, (columns - 155).abs() < 0.01
@@ -306,7 +310,7 @@ def test_both_sides_of_an_upright_strip_have_rims(focal_px: float) -> None:
     """However many of its pixels are left out between."""
     camera = camera_from(0, focal_px=focal_px)
     edge = ((torch.arange(WIDTH) + 0.5 - 150).abs() - 40).expand(HEIGHT, WIDTH)
-    columns = project(camera, rim_points(seen([camera], [edge]), torch.zeros(32, 32, 32))[0])[0][:, 0]
+    columns = project(camera, touched(seen([camera], [edge]), torch.zeros(32, 32, 32))[0])[0][:, 0]
     left, right = int((columns < 150).sum()), int((columns > 150).sum())
     assert min(left, right) > 0.4 * (left + right)
 
