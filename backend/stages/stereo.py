@@ -80,7 +80,7 @@ def _points(views: tuple[View, ...], sizes: list[list[Measured]], config: Stereo
     found = sum(int((measured.votes > 0).sum()) for maps in sizes for measured in maps)
     stride = max(1, math.ceil(found / config.max_points))
     parts = [
-        _points_of_map(index, view, measured, _pixel_size(measured, maps[0]), stride, config)
+        _points_of_map(index, view, measured, stride, config)
         for index, (view, maps) in enumerate(zip(views, sizes, strict=True))
         for measured in maps
     ]
@@ -96,7 +96,7 @@ def _points(views: tuple[View, ...], sizes: list[list[Measured]], config: Stereo
 
 
 def _points_of_map(
-    index: int, view: View, measured: Measured, pixel_size: float, stride: int, config: StereoConfig
+    index: int, view: View, measured: Measured, stride: int, config: StereoConfig
 ) -> list[Tensor]:
     """Positions, normals, colours, confidence, votes, and the view's number."""
     map_, votes = measured.map, measured.votes
@@ -108,27 +108,23 @@ def _points_of_map(
     positions = unproject(camera, pixels, 1 / map_.inverse_depth.clamp(min=1e-6))
     direction = F.normalize(camera.position - positions, dim=-1)
     facing = (normals * direction).sum(dim=-1).clamp(min=0)
-    confidence = _confidence(measured, pixel_size, config) * facing.sqrt()  # grazing views measure worse
+    confidence = _confidence(measured, config) * facing.sqrt()  # grazing views measure worse
     image = torch.tensor(view.image_srgb, device=votes.device).permute(2, 0, 1)
     corner = pixels.new_tensor([map_.window.left, map_.window.top])
-    colours = sample_image(image, (pixels * pixel_size + corner)[None])[0].permute(1, 2, 0)
+    colours = sample_image(image, (pixels * map_.window.pixel_size + corner)[None])[0].permute(1, 2, 0)
     mask = mask & (facing > 0.05) & _every(stride, mask)
     number = torch.full_like(votes, index)
     return [positions[mask], normals[mask], colours[mask], confidence[mask], votes[mask], number[mask]]
 
 
-def _pixel_size(measured: Measured, full: Measured) -> float:
-    """Of a map, in pixels of the photograph."""
-    return float(full.map.window.camera.intrinsics[0, 0] / measured.map.window.camera.intrinsics[0, 0])
-
-
-def _confidence(measured: Measured, pixel_size: float, config: StereoConfig) -> Float[Tensor, "height width"]:
+def _confidence(measured: Measured, config: StereoConfig) -> Float[Tensor, "height width"]:
     """Agreement of the patches; where two views agree, half as much as where many do; less for large pixels.
 
     0 where nothing is measured.
     """
     certain = -torch.expm1(-0.7 * (measured.votes - 1).clamp(min=0))
-    trust: float = config.trust_of_half_size ** math.log2(pixel_size)
+    halvings = math.log2(max(1.0, measured.map.window.pixel_size / config.first_pixel_size))
+    trust: float = config.trust_of_half_size**halvings
     confidence: Float[Tensor, "height width"] = trust * measured.map.score.clamp(0, 1) * certain
     return confidence
 
@@ -142,12 +138,12 @@ def _every(stride: int, mask: Bool[Tensor, "height width"]) -> Bool[Tensor, "hei
 def _full_size(view: View, maps: list[Measured], region: Region, config: StereoConfig) -> DepthMap:
     """What was measured at any size, over the whole photograph."""
     window = maps[0].map.window
-    pixels = pixel_centres(window.camera.width, window.camera.height, window.grey.device)
-    inverse_depth, confidence = torch.ones_like(window.grey), torch.zeros_like(window.grey)
+    width, height = (side * window.pixel_size for side in (window.camera.width, window.camera.height))
+    pixels = pixel_centres(width, height, window.grey.device)
+    inverse_depth, confidence = torch.ones_like(pixels[..., 0]), torch.zeros_like(pixels[..., 0])
     for measured in reversed(maps):
-        pixel_size = _pixel_size(measured, maps[0])
-        at = (pixels / pixel_size)[None]
-        sure = sample_image(_confidence(measured, pixel_size, config)[None], at, mode="nearest")[0, 0]
+        at = (pixels / measured.map.window.pixel_size)[None]
+        sure = sample_image(_confidence(measured, config)[None], at, mode="nearest")[0, 0]
         there = sample_image(measured.map.inverse_depth[None], at)[0, 0]
         inverse_depth = torch.where(sure > 0, there, inverse_depth)
         confidence = torch.where(sure > 0, sure, confidence)
@@ -158,11 +154,7 @@ def _full_size(view: View, maps: list[Measured], region: Region, config: StereoC
         backdrop = find_backdrop(colours, seen)
     whole = np.zeros((2, view.camera.height, view.camera.width), np.float32)
     known = torch.stack([torch.where(confidence > 0, 1 / inverse_depth.clamp(min=1e-6), 0.0), confidence])
-    rows, columns = (
-        slice(window.top, window.top + len(pixels)),
-        slice(window.left, window.left + pixels.shape[1]),
-    )
-    whole[:, rows, columns] = known.cpu().numpy()
+    whole[:, window.top : window.top + height, window.left : window.left + width] = known.cpu().numpy()
     depth, confidence_map = whole
     return DepthMap(
         depth=depth,

@@ -22,6 +22,8 @@ class Window:
     left: int
     """First column, in pixels of the view."""
     top: int
+    pixel_size: int
+    """In pixels of the view, along an axis: a power of two."""
     camera: Pinhole
     grey: Float[Tensor, "height width"]
     """Free of its local mean."""
@@ -31,7 +33,7 @@ class Window:
 
 
 def pyramid(view: View, region: Region, config: StereoConfig, device: torch.device) -> list[Window]:
-    """The view's window at full size, half, quarter, ... until all depths can be tried."""
+    """The view's window at its first size, half, quarter, ... until all depths can be tried."""
     camera = pinhole_in_object(view.camera, region, device)
     colours = torch.tensor(view.image_srgb, device=device).permute(2, 0, 1)
     image = colours.mean(dim=0)
@@ -45,17 +47,27 @@ def pyramid(view: View, region: Region, config: StereoConfig, device: torch.devi
     grey = image[top : top + height, left : left + width]
     subject = subject[top : top + height, left : left + width]
     noise = config.noise * _exposure(grey)
-    windows = []
+    windows: list[Window] = []
+    pixel_size = 1
     while True:
-        flat = without_local_mean(grey, subject.float(), 2 * config.patch_radius)
-        patches = patch_statistics(flat, subject.float(), config.patch_radius)
-        windows.append(
-            Window(
-                noise=noise, left=left, top=top, camera=camera, grey=flat, patches=patches, subject=subject
+        is_last = grey.numel() <= config.coarse_pixels or min(grey.shape) < 64
+        if pixel_size >= config.first_pixel_size or is_last:
+            flat = without_local_mean(grey, subject.float(), 2 * config.patch_radius)
+            windows.append(
+                Window(
+                    left=left,
+                    top=top,
+                    pixel_size=pixel_size,
+                    camera=camera,
+                    grey=flat,
+                    patches=patch_statistics(flat, subject.float(), config.patch_radius),
+                    noise=noise,
+                    subject=subject,
+                )
             )
-        )
-        if grey.numel() <= config.coarse_pixels or min(grey.shape) < 64:
+        if is_last:
             return windows
+        pixel_size *= 2
         height, width = grey.shape[0] // 2, grey.shape[1] // 2
         even = grey[: 2 * height, : 2 * width]
         grey = F.avg_pool2d(even[None], 2)[0]

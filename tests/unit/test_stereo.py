@@ -116,6 +116,30 @@ def test_weak_texture_is_measured_on_smaller_photographs() -> None:
         np.testing.assert_array_equal(all_sizes.depth[fine.depth > 0], fine.depth[fine.depth > 0])
 
 
+def test_photographs_may_be_compared_at_half_their_size() -> None:
+    """A quarter of the points; the depth map is as large as the photograph and as full as before."""
+    wide = photographed(arc_cameras(3, 30, 320))
+    whole, half = (
+        match_views(
+            wide.views,
+            true_region(),
+            StereoConfig(coarse_pixels=10_000, first_pixel_size=size),
+            device=torch.device("cpu"),
+            progress=no_progress,
+        )
+        for size in (1, 2)
+    )
+    assert len(half.points.positions) == pytest.approx(len(whole.points.positions) / 4, rel=0.1)
+    assert np.median(errors_percent(half)) < 0.15
+    assert half.points.confidence.mean() == pytest.approx(whole.points.confidence.mean(), rel=0.15)
+    for found, truth, covered in zip(half.depth_maps, wide.depths, wide.coverage, strict=True):
+        measured = (found.depth > 0) & covered
+        assert found.depth.shape == truth.shape
+        assert measured.sum() > 0.85 * covered.sum()
+        apart = 100 * np.abs(found.depth[measured] * OBJECT_UNIT - truth[measured]) / diagonal()
+        assert np.median(apart) < 0.15
+
+
 def test_points_lie_on_the_surface() -> None:
     apart = errors_percent(matched())
     assert len(apart) > 15_000
