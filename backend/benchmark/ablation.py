@@ -60,7 +60,8 @@ VARIANTS = (
         value=_NEXT_TO_NOTHING,
     ),
     Variant(name="five rounds of inequalities", setting="train.rounds", value=(5, 5, 5)),
-    Variant(name="without rendering", setting="train.steps", value=(0, 0, 0)),
+    Variant(name="with 100 steps of rendering", setting="train.steps", value=(0, 0, 100)),
+    Variant(name="full size alone", setting="stereo.trust_of_half_size", value=0.0),
     Variant(name="masks ignored", with_masks=False),
 )
 

@@ -17,6 +17,8 @@ from ..maths.smooth_fit import fit_smooth
 from .measurements import Measurements
 from .rims import RimRays, rim_points, rim_rays
 
+_FADE = 0.7
+"""Share of its pull that a missed ray keeps in the next round: rays that are hit by then let go."""
 LEAST_RADIUS = 0.3
 """Of the ball behind the surface, in half widths of the subject."""
 
@@ -107,7 +109,7 @@ def fit_level(
     ball = _ball_behind(scene, nodes)
     outside = _free_distance(scene, nodes)
     through = _seen_through_any(scene, nodes, 3 * h)
-    missed = torch.zeros((nodes**3, 1), device=before.device)
+    missed = torch.zeros((nodes**3, 2), device=before.device)
     rays, nearest = rim_rays(scene, nodes), cKDTree(points[0].cpu().numpy())
     distance = before
     for _ in range(rounds):
@@ -116,12 +118,15 @@ def fit_level(
         target[carved], weight[carved] = outside[carved], config.free_space
         carved = through & (distance < 2 * h)
         target[carved], weight[carved] = 2 * h, config.seen_through
-        missed += splat(*_missed_silhouettes(scene, distance), nodes)
-        pull = config.silhouettes * missed.reshape(distance.shape).clamp(max=1.0) * (outside < 0)
+        missed = _FADE * missed + splat(*_missed_silhouettes(scene, distance), nodes)
+        rays_near, depths = missed.reshape(*distance.shape, 2).unbind(-1)
+        pull = config.silhouettes * rays_near.clamp(max=1.0) * (outside < 0)
+        inside = depths / rays_near.clamp(min=1e-6)
         rims = _rim_distances(scene, rays, distance, nearest, config.rims)
         rim_weight = rims.weight.clamp(max=2.0)
         total = weight + measured_weight + pull + rim_weight
-        target = weight * target + measured_weight * measured.distance - pull * h + rim_weight * rims.distance
+        target = weight * target + measured_weight * measured.distance
+        target += rim_weight * rims.distance - pull * inside
         distance = ball + fit_smooth(
             target / total - ball, total, distance - ball, smoothness=config.smoothness, steps=30
         )
@@ -148,10 +153,13 @@ def _rim_distances(
 
 def _missed_silhouettes(
     scene: Measurements, distance: Float[Tensor, "nodes nodes nodes"]
-) -> tuple[Float[Tensor, "rays 1"], Corners]:
-    """Rays through masks that miss the field's inside: ones, and the places where they come nearest to it."""
+) -> tuple[Float[Tensor, "rays 2"], Corners]:
+    """Rays through masks that miss the field's inside, and the places where they come nearest to it.
+
+    For each 1, and how deep inside it should be there: as far as from the outline, but not more than a cell.
+    """
     nodes = distance.shape[0]
-    places = []
+    places, depths = [scene.positions[:0]], [scene.confidence[:0]]
     for camera, outline in zip(scene.cameras, scene.certain, strict=True):
         if outline is None:
             continue
@@ -159,7 +167,8 @@ def _missed_silhouettes(
         rows, columns = torch.nonzero(outline[::step, ::step] < -0.5 * step, as_tuple=True)
         pixels = torch.stack([columns, rows], dim=-1) * step + 0.5
         directions = F.normalize(ray_directions(camera, pixels), dim=-1)
-        directions = directions[_meets_region(scene, camera, directions)]
+        meets = _meets_region(scene, camera, directions)
+        directions, rows, columns = directions[meets], rows[meets], columns[meets]
         origins = camera.position.expand_as(directions)
         crossing = first_crossing(
             lambda x: read(distance, x),
@@ -172,8 +181,10 @@ def _missed_silhouettes(
         )
         missed = ~crossing.hit
         places.append((origins + crossing.along[:, None] * directions)[missed])
-    points = torch.cat(places) if places else scene.positions[:0]
-    return torch.ones_like(points[:, :1]), locate(points, nodes)
+        inside_px = -outline[rows[missed] * step, columns[missed] * step]
+        depths.append(inside_px * crossing.along[missed] / camera.intrinsics[0, 0])
+    depth = torch.cat(depths).clamp(max=spacing(nodes))
+    return torch.stack([torch.ones_like(depth), depth], dim=-1), locate(torch.cat(places), nodes)
 
 
 def _meets_region(

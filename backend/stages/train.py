@@ -33,7 +33,7 @@ class TrainConfig:
 
     levels: tuple[int, ...] = (32, 64, 128)
     """Nodes along each axis of the grids, coarse to fine."""
-    steps: tuple[int, ...] = (0, 0, 100)
+    steps: tuple[int, ...] = (0, 0, 0)
     """Gradient steps at each level."""
     rounds: tuple[int, ...] = (15, 15, 10)
     """How often the linear fit asks at each level which inequalities are broken."""
