@@ -228,9 +228,12 @@ def support_of(
     cell: float,
 ) -> Float32[np.ndarray, "vertices"]:
     """How well photographs back every vertex, 0 to 1 (see the module's first lines)."""
-    distance, nearest = cKDTree(points).query(vertices, k=min(8, len(points)), workers=-1)
+    # beyond, the bell is less than 1e-10; a search without a bound is slow where no point is near
+    distance, nearest = cKDTree(points).query(
+        vertices, k=min(8, len(points)), distance_upper_bound=7.5 * cell, workers=-1
+    )
     near = np.exp(-((np.atleast_2d(distance.T).T / (1.5 * cell)) ** 2))
-    near *= confidence[np.atleast_2d(nearest.T).T]
+    near *= np.append(confidence, 0.0)[np.atleast_2d(nearest.T).T]  # the last for those that found none
     measured = -np.expm1(-near.sum(axis=1))
     looked_at = -np.expm1(-seen.sum(axis=1).astype(np.float64))
     return np.asarray(0.7 * measured + 0.3 * looked_at, np.float32)
