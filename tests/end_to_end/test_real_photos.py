@@ -71,7 +71,8 @@ def test_the_statuette_fills_its_masks(statuette: Result) -> None:
 
 def test_the_statuette_looks_like_its_photographs(statuette: Result) -> None:
     assert least(statuette, "psnr_db") > 24
-    assert statuette.report["num_stereo_points"] > 120_000
+    # each stands for four pixels: `fast` compares photographs at half their size
+    assert 4 * statuette.report["num_stereo_points"] > 240_000
 
 
 def test_the_statuette_is_closed_and_of_its_size(statuette: Result) -> None:
