@@ -14,11 +14,11 @@ from pathlib import Path
 
 from backend.benchmark.ablation import COLUMNS, PRESET, VARIANTS, measure_variants
 from backend.benchmark.measuring import Measurement
-from backend.benchmark.suites import CASES, Suite, find_cases
+from backend.benchmark.suites import CASES
 from backend.benchmark.summary import aggregate, table
 from backend.benchmark.writing import machine_facts
 from backend.machine import choose_device, set_up_torch
-from backend.wire.protocol import DEVICES
+from benchmarks.chosen import add_places, chosen_cases
 
 _NAMES = {variant.name: variant for variant in VARIANTS}
 logger = logging.getLogger(__name__)
@@ -29,12 +29,9 @@ def parser() -> argparse.ArgumentParser:
     made = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     add = made.add_argument
     add("--cases", nargs="+", choices=tuple(CASES), metavar="CASE", default=["monkey_3", "plaster_6"])
-    add("--scenes", metavar="DIR", type=Path, help="rendered scenes")
-    add("--photos", metavar="DIR", type=Path, help="sets of real photographs")
-    add("--output", metavar="DIR", type=Path, required=True)
     add("--variants", nargs="+", choices=tuple(_NAMES), metavar="NAME", default=tuple(_NAMES))
     add("--seeds", type=int, metavar="N", default=1, help="how often to run what is random (1)")
-    add("--device", choices=DEVICES, default="auto", help="where to compute (auto)")
+    add_places(made)
     return made
 
 
@@ -43,16 +40,13 @@ def main() -> int:
     words = parser()
     parsed = words.parse_args()
     logging.basicConfig(level=logging.INFO, format="%(message)s", stream=sys.stderr)
-    chosen = Suite(name="chosen", cases=tuple(CASES[name] for name in parsed.cases))
-    found = find_cases(chosen, parsed.scenes, parsed.photos)
-    if found.missing:
-        words.error(f"files are missing of {', '.join(found.missing)}")
+    cases = chosen_cases(words, parsed, [CASES[name] for name in parsed.cases])
     device = choose_device(parsed.device)
     set_up_torch(device)
     variants = [_NAMES[name] for name in parsed.variants]
     parsed.output.mkdir(parents=True, exist_ok=True)
     runs: list[Measurement] = []
-    for case, folder in found.cases:
+    for case, folder in cases:
         for run in measure_variants(case, folder, variants, num_seeds=parsed.seeds, device=device):
             runs.append(run)
             logger.info("%s, %s, seed %d: %s", run.case, run.preset, run.seed, run.failure or "done")

@@ -16,8 +16,8 @@ from dataclasses import asdict
 from pathlib import Path
 
 from backend.benchmark.scaling import SWEEPS, Cost, Setup, exponents, least, measure, table, verdict
-from backend.benchmark.suites import CASES, Case, Suite, find_cases
-from backend.wire.protocol import DEVICES
+from backend.benchmark.suites import CASES, Case
+from benchmarks.chosen import add_places, chosen_cases
 
 logger = logging.getLogger(__name__)
 
@@ -27,12 +27,9 @@ def parser() -> argparse.ArgumentParser:
     made = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     add = made.add_argument
     add("--case", choices=tuple(CASES), metavar="CASE", default="monkey_12")
-    add("--scenes", metavar="DIR", type=Path, help="rendered scenes")
-    add("--photos", metavar="DIR", type=Path, help="sets of real photographs")
-    add("--output", metavar="DIR", type=Path, required=True)
     add("--sweeps", nargs="+", choices=tuple(SWEEPS), default=tuple(SWEEPS))
     add("--repeats", type=int, metavar="N", default=1, help="the least of N runs counts (1)")
-    add("--device", choices=DEVICES, default="auto", help="where to compute (auto)")
+    add_places(made)
     return made
 
 
@@ -41,10 +38,7 @@ def main() -> int:
     words = parser()
     parsed = words.parse_args()
     logging.basicConfig(level=logging.INFO, format="%(message)s", stream=sys.stderr)
-    found = find_cases(Suite(name="chosen", cases=(CASES[parsed.case],)), parsed.scenes, parsed.photos)
-    if found.missing:
-        words.error(f"files are missing of {', '.join(found.missing)}")
-    ((case, folder),) = found.cases
+    ((case, folder),) = chosen_cases(words, parsed, [CASES[parsed.case]])
     parsed.output.mkdir(parents=True, exist_ok=True)
     done: dict[str, list[Cost]] = {}
     for sweep in parsed.sweeps:

@@ -1,7 +1,7 @@
 """What each part is worth: the stages after the cameras, with one part changed at a time."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -12,9 +12,10 @@ from ..errors import ReconstructionError
 from ..maths.metrics import TrueSurface, load_truth, surface_error
 from ..presets import PRESETS, Settings
 from ..scene import SurfaceMesh
+from ..stages.report import error_numbers
 from ..stages.stereo import StereoResult
 from ..stages.stereo_config import StereoConfig
-from .measuring import Measurement
+from .measuring import Measurement, flat_errors
 from .one_by_one import Placed, extract, fit, match, place
 from .suites import Case
 from .summary import Column
@@ -118,12 +119,7 @@ def _errors(mesh: SurfaceMesh, truth: TrueSurface, placed: Placed, seed: int) ->
     cameras = [view.camera for view in placed.views]
     num_samples = PRESETS[PRESET].report.error_samples
     error = surface_error(mesh, truth, cameras=cameras, seed=seed, num_samples=num_samples)
-    numbers: dict[str, float | None] = {}
-    for part, found in (("visible", error.visible), ("whole", error.whole)):
-        if found is not None:
-            numbers[f"{part}_chamfer_percent"] = found.chamfer_percent
-            numbers |= {f"{part}_{name}": value for name, value in asdict(found).items()}
-    return numbers
+    return flat_errors(error_numbers(error))
 
 
 def _changed(settings: Any, name: str, value: object) -> Any:

@@ -119,7 +119,12 @@ def report_numbers(report: Mapping[str, Any]) -> dict[str, float | None]:
     numbers["total_s"] = report["total_seconds"]
     numbers["peak_memory_bytes"] = report["peak_memory_bytes"]
     numbers["given_psnr_db"] = report["mean_psnr_db"]
-    error = report["error"] or {}
+    return numbers | flat_errors(report["error"] or {})
+
+
+def flat_errors(error: Mapping[str, Any]) -> dict[str, float | None]:
+    """The error of a report, flat; None for what was not compared with a truth."""
+    numbers: dict[str, float | None] = {}
     for part in ("visible", "whole"):
         found = error.get(part) or {}
         numbers |= {f"{part}_{name}": found.get(name) for name in _ERRORS}

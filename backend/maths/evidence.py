@@ -78,6 +78,11 @@ def merged_points(
     return kept[:, :3] / kept[:, 6:], F.normalize(kept[:, 3:6], dim=-1), kept[:, 6]
 
 
+def half_cell_px(camera: Pinhole, nodes: int) -> int:
+    """About half a cell of the grid in pixels of a photograph, at the grid's middle; at least 1."""
+    return max(1, round(float(spacing(nodes) * camera.intrinsics[0, 0] / camera.position.norm()) / 2))
+
+
 def _offsets(first: int, last: int, device: torch.device) -> Int[Tensor, "offsets 3"]:
     steps = torch.arange(first, last + 1, device=device)
     return torch.cartesian_prod(steps, steps, steps)

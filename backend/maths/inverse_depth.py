@@ -8,12 +8,11 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 from jaxtyping import Bool, Float, Float32, Int, Int64
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 
 from .correlation import window_sum
 from .geometry import Pinhole, pixel_centres
+from .pieces import connected_pieces
 
 
 def fit_planes(
@@ -95,9 +94,7 @@ def piece_sizes(
     for one, other in ((np.s_[:, 1:], np.s_[:, :-1]), (np.s_[1:], np.s_[:-1])):
         apart = np.abs(inverse_depth[one] - inverse_depth[other])
         joined = measured[one] & measured[other] & (apart < largest_jump * inverse_depth[one])
-        pairs.append((number[one][joined], number[other][joined]))
-    rows, columns = (np.concatenate(side) for side in zip(*pairs, strict=True))
-    links = coo_array((np.ones(len(rows), bool), (rows, columns)), shape=(height * width,) * 2)
-    _, piece = connected_components(links, directed=False)
+        pairs.append(np.stack([number[one][joined], number[other][joined]]))
+    piece = connected_pieces(np.concatenate(pairs, axis=1), height * width)
     sizes: Int64[np.ndarray, "height width"] = np.bincount(piece)[piece].reshape(height, width)
     return sizes

@@ -126,14 +126,15 @@ def _grown(
     radius = config.patch_radius + 1
     planes = fit_planes(current.inverse_depth, seeds * current.score.clamp(min=0) ** 2, radius)
     known = window_sum(seeds.float(), radius) >= _LEAST_FOR_A_PLANE
-    hypotheses = []
+    planes_beside = []
     for du, dv in ((0, 0), (reach, 0), (-reach, 0), (0, reach), (0, -reach)):
         value, slope_u, slope_v = _moved(planes, du, dv)
         continued = (value - du * slope_u - dv * slope_v).clamp(far, near)
-        hypotheses.append(torch.where(_moved(known, du, dv), continued, current.inverse_depth))
-    score, index = _scores(window, sources, torch.stack(hypotheses), config).max(dim=0)
+        planes_beside.append(torch.where(_moved(known, du, dv), continued, current.inverse_depth))
+    hypotheses = torch.stack(planes_beside)
+    score, index = _scores(window, sources, hypotheses, config).max(dim=0)
     better = ~seeds & (score > current.score)
-    chosen = torch.stack(hypotheses).gather(0, index[None])[0]
+    chosen = hypotheses.gather(0, index[None])[0]
     grown = Map(
         window=window,
         inverse_depth=torch.where(better, chosen, current.inverse_depth),

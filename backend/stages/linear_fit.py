@@ -9,7 +9,14 @@ from jaxtyping import Bool, Float
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from ..maths.evidence import PointDistances, merged_points, off_silhouette, point_distances, seen_through
+from ..maths.evidence import (
+    PointDistances,
+    half_cell_px,
+    merged_points,
+    off_silhouette,
+    point_distances,
+    seen_through,
+)
 from ..maths.geometry import Pinhole, project, ray_directions
 from ..maths.grid import Corners, locate, node_positions, read, spacing, splat
 from ..maths.rays import first_crossing, sphere_entry
@@ -17,12 +24,10 @@ from ..maths.smooth_fit import fit_smooth
 from .measurements import Measurements
 from .rims import RimRays, rim_points, rim_rays
 
-_FADE = 0.7
-"""Share of its pull that a missed ray keeps in the next round: rays that are hit by then let go."""
 LEAST_RADIUS = 0.3
 """Of the ball behind the surface, in half widths of the subject."""
-
-
+_FADE = 0.7
+"""Share of its pull that a missed ray keeps in the next round: rays that are hit by then let go."""
 _RIM_REACH = 0.2
 """How far from a measured point a rim is sure, in units of the grid's frame, if depth is not bounded."""
 
@@ -163,7 +168,7 @@ def _missed_silhouettes(
     for camera, outline in zip(scene.cameras, scene.certain, strict=True):
         if outline is None:
             continue
-        step = max(1, round(float(spacing(nodes) * camera.intrinsics[0, 0] / camera.position.norm()) / 2))
+        step = half_cell_px(camera, nodes)
         rows, columns = torch.nonzero(outline[::step, ::step] < -0.5 * step, as_tuple=True)
         pixels = torch.stack([columns, rows], dim=-1) * step + 0.5
         directions = F.normalize(ray_directions(camera, pixels), dim=-1)

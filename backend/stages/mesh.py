@@ -11,13 +11,12 @@ import numpy as np
 import torch
 import trimesh
 from jaxtyping import Bool, Float32, Float64, Int64, UInt8
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 from skimage.measure import marching_cubes
 
 from ..errors import ErrorCode, ReconstructionError
 from ..maths.grid import near_surface, refined, spacing
+from ..maths.pieces import connected_pieces
 from ..maths.raycast import RayCaster, visible_from
 from ..maths.sampling import colours_at
 from ..scene import Decision, Progress, Region, SurfaceMesh, View, transform_points
@@ -174,9 +173,8 @@ def in_seen_pieces(
 def _piece_of_faces(faces: Faces, num_vertices: int) -> Int64[np.ndarray, "faces"]:
     """Number of each face's connected piece."""
     edges = faces[:, [0, 1, 1, 2]].reshape(-1, 2)
-    graph = coo_array((np.ones(len(edges), bool), edges.T), shape=(num_vertices,) * 2)
-    _, piece = connected_components(graph, directed=False)
-    return np.asarray(piece[faces[:, 0]], np.int64)
+    piece: Int64[np.ndarray, "faces"] = connected_pieces(edges.T, num_vertices)[faces[:, 0]]
+    return piece
 
 
 def only_used(vertices: Vertices, faces: Faces) -> tuple[KeptVertices, Faces]:

@@ -267,7 +267,7 @@ def report_numbers(report: Report) -> dict[str, object]:
         "mesh": dataclasses.asdict(report.mesh),
         "mean_psnr_db": _finite_or_none(report.mean_psnr_db),
         "photos": [_photo_numbers(photo) for photo in report.photos],
-        "error": None if report.error is None else _error_numbers(report.error),
+        "error": None if report.error is None else error_numbers(report.error),
     }
 
 
@@ -364,7 +364,9 @@ def _photo_numbers(photo: PhotoFit) -> dict[str, object]:
     }
 
 
-def _error_numbers(error: ErrorAgainstTruth) -> dict[str, object]:
+def error_numbers(error: ErrorAgainstTruth) -> dict[str, object]:
+    """The error with units in the keys, as report.json holds it."""
+
     def part(found: SurfaceError | None) -> dict[str, object] | None:
         if found is None:
             return None

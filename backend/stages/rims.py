@@ -13,6 +13,7 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
+from ..maths.evidence import half_cell_px
 from ..maths.geometry import ray_directions
 from ..maths.grid import read, spacing
 from .measurements import Measurements
@@ -39,8 +40,7 @@ def rim_rays(scene: Measurements, nodes: int) -> RimRays:
         if edge is None:
             continue
         surely = edge.abs() if empty is None else torch.maximum(edge.abs(), empty.abs() - 1)
-        cell_px = float(spacing(nodes) * camera.intrinsics[0, 0] / camera.position.norm())
-        pixels, across = _outline(edge, surely, max(1, round(cell_px / 2)))
+        pixels, across = _outline(edge, surely, half_cell_px(camera, nodes))
         directions = F.normalize(ray_directions(camera, pixels), dim=-1)
         # the line n . p = c of the image is the plane K^T (n, -c) of camera axes through the camera
         line = torch.cat([across, -(across * pixels).sum(dim=-1, keepdim=True)], dim=-1)

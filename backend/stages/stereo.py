@@ -4,7 +4,8 @@ Per photograph: a plane sweep in inverse depth over the region at a coarse size,
 semi-global matching; then, finer and finer, a few hypotheses around planes fitted to the map so
 far, so that every patch is compared along the slant of the surface it lies on; and what is measured
 grows into what is not. A point is kept where another photograph's depth map puts the same point;
-what only two photographs agree on is kept with a lower confidence, not dropped.
+what only two photographs agree on is kept with a lower confidence, not dropped, and so is what only
+smaller sizes of the photographs measure.
 """
 
 import math
@@ -79,11 +80,10 @@ def _check_enough(points: SurfacePoints) -> None:
 def _points(views: tuple[View, ...], sizes: list[list[Measured]], config: StereoConfig) -> SurfacePoints:
     found = sum(int((measured.votes > 0).sum()) for maps in sizes for measured in maps)
     stride = max(1, math.ceil(found / config.max_points))
-    parts = [
-        _points_of_map(index, view, measured, stride, config)
-        for index, (view, maps) in enumerate(zip(views, sizes, strict=True))
-        for measured in maps
-    ]
+    parts: list[list[Tensor]] = []
+    for index, (view, maps) in enumerate(zip(views, sizes, strict=True)):
+        image = torch.tensor(view.image_srgb, device=maps[0].votes.device).permute(2, 0, 1)
+        parts += [_points_of_map(index, image, measured, stride, config) for measured in maps]
     joined = [torch.cat(column).cpu().numpy() for column in zip(*parts, strict=True)]
     return SurfacePoints(
         positions=joined[0],
@@ -96,7 +96,11 @@ def _points(views: tuple[View, ...], sizes: list[list[Measured]], config: Stereo
 
 
 def _points_of_map(
-    index: int, view: View, measured: Measured, stride: int, config: StereoConfig
+    index: int,
+    image: Float[Tensor, "3 height width"],
+    measured: Measured,
+    stride: int,
+    config: StereoConfig,
 ) -> list[Tensor]:
     """Positions, normals, colours, confidence, votes, and the view's number."""
     map_, votes = measured.map, measured.votes
@@ -109,7 +113,6 @@ def _points_of_map(
     direction = F.normalize(camera.position - positions, dim=-1)
     facing = (normals * direction).sum(dim=-1).clamp(min=0)
     confidence = _confidence(measured, config) * facing.sqrt()  # grazing views measure worse
-    image = torch.tensor(view.image_srgb, device=votes.device).permute(2, 0, 1)
     corner = pixels.new_tensor([map_.window.left, map_.window.top])
     colours = sample_image(image, (pixels * map_.window.pixel_size + corner)[None])[0].permute(1, 2, 0)
     mask = mask & (facing > 0.05) & _every(stride, mask)

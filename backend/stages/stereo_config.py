@@ -26,7 +26,7 @@ class StereoConfig:
     max_points: int = 500_000
     """Points kept, evenly over all that are measured; depth maps keep every pixel."""
     growth_rounds: tuple[int, int, int] = (2, 4, 4)
-    """How often maps grow from what is measured, at full size, at half, and at any smaller size."""
+    """How often maps grow from what is measured, at the first size, at half of it, and at any smaller one."""
     growth_reach_px: int = 5
     """How far at a time, in pixels of the size at hand."""
     growth_correlation: float = 0.5
