@@ -237,4 +237,5 @@ else:
 
     def _kill_group(process: subprocess.Popen[bytes]) -> None:
         if process.poll() is None:  # else the number may belong to somebody else by now
-            os.killpg(process.pid, signal.SIGKILL)
+            with suppress(ProcessLookupError):  # it may end between the two
+                os.killpg(process.pid, signal.SIGKILL)
