@@ -36,9 +36,12 @@ def first_crossing(
     *,
     reach: float = 2.0,
     shortest: float = 0.005,
+    longest: float = 0.1,
     steps: int = 40,
 ) -> Crossing:
-    """Sphere tracing from `start`, at least `shortest` a step; the crossing by the secant.
+    """Sphere tracing from `start`, `shortest` to `longest` a step; the crossing by the secant.
+
+    Far from the surface a fitted field may grow faster than the distance, and whole steps would leap over it.
 
     A ray that never meets the surface gets the place where it came nearest, so that the silhouette
     can be moved towards or away from it. Rays end `reach` after their start.
@@ -56,5 +59,5 @@ def first_crossing(
         crossing = torch.where(new, before_along + share * (along - before_along), crossing)
         hit = hit | new
         before_along, before = along, here
-        along = (along + (0.95 * here).clamp(min=shortest)).minimum(start + reach)
+        along = (along + (0.95 * here).clamp(shortest, longest)).minimum(start + reach)
     return Crossing(along=torch.where(hit, crossing, nearest_along), hit=hit)

@@ -4,28 +4,18 @@ import math
 from dataclasses import dataclass
 
 import torch
-import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from ..maths.evidence import (
-    PointDistances,
-    half_cell_px,
-    merged_points,
-    off_silhouette,
-    point_distances,
-    seen_through,
-)
-from ..maths.geometry import Pinhole, project, ray_directions
-from ..maths.grid import Corners, locate, node_positions, read, spacing, splat
-from ..maths.rays import first_crossing, sphere_entry
+from ..maths.evidence import PointDistances, merged_points, point_distances, seen_through
+from ..maths.grid import locate, spacing, splat
 from ..maths.smooth_fit import fit_smooth
 from .measurements import Measurements
 from .rims import RimRays, rim_points, rim_rays
+from .silhouettes import SilhouetteRays, least_distance, missing, silhouette_rays
+from .unseen_side import ball_behind, depth_is_bounded
 
-LEAST_RADIUS = 0.3
-"""Of the ball behind the surface, in half widths of the subject."""
 _FADE = 0.7
 """Share of its pull that a missed ray keeps in the next round: rays that are hit by then let go."""
 _RIM_REACH = 0.2
@@ -50,59 +40,21 @@ class LinearConfig:
     """Of the level before, at 32 nodes; more than 0."""
 
 
-def start(scene: Measurements, nodes: int) -> Float[Tensor, "nodes nodes nodes"]:
+def start(scene: Measurements, radius: float, nodes: int) -> Float[Tensor, "nodes nodes nodes"]:
     """A field to begin with: the ball behind the surface, cut by what is free."""
-    return torch.maximum(_ball_behind(scene, nodes), _free_distance(scene, nodes))
-
-
-def _ball_behind(scene: Measurements, nodes: int) -> Float[Tensor, "nodes nodes nodes"]:
-    """All that is known of backs: (|x - c|^2 - r^2) / 2r of the ball that explains the measured points.
-
-    Least squares of p = c + r n over points and normals: for points all around it is the object's size,
-    for points on one side what the turning of their normals says. Where the photographs are taken from
-    sides far enough apart for silhouettes to bound the depth, it is as large as the subject is wide.
-    """
-    weight = (scene.confidence / scene.confidence.sum())[:, None]
-    mean_p, mean_n = (weight * scene.positions).sum(dim=0), (weight * scene.normals).sum(dim=0)
-    spread = (weight * (scene.normals - mean_n).square()).sum()
-    together = (weight * (scene.positions - mean_p) * (scene.normals - mean_n)).sum()
-    widest = _half_width(scene, mean_p)
-    explained = float((together / spread.clamp(min=1e-6)).clamp(LEAST_RADIUS * widest, widest))
-    radius = explained + _depth_is_bounded(scene) * (widest - explained)
-    apart = node_positions(nodes, scene.positions.device) - (mean_p - radius * mean_n)
-    return (apart.square().sum(dim=-1) - radius * radius) / (2 * radius)
-
-
-def widest_angle_deg(scene: Measurements) -> float:
-    """Largest angle between two cameras, seen from the region's middle."""
-    directions = F.normalize(torch.stack([c.position for c in scene.cameras]) - scene.region_centre, dim=-1)
-    return math.degrees(math.acos(float((directions @ directions.T).min().clamp(-1, 1))))
-
-
-def _depth_is_bounded(scene: Measurements) -> float:
-    """Whether silhouettes bound the depth: 0 if the photographs are taken from one side, 1 if from many."""
-    return min(max((widest_angle_deg(scene) - 50) / 40, 0.0), 1.0)
-
-
-def _half_width(scene: Measurements, at: Float[Tensor, "3"]) -> float:
-    """Largest half extent of the subject across the views, at the distance of a point of it."""
-    widths = []
-    for camera, outline in zip(scene.cameras, scene.outlines, strict=True):
-        if outline is not None:
-            rows, columns = torch.nonzero(outline < 0, as_tuple=True)
-            middle_r, middle_c = (rows.max() + rows.min()) / 2, (columns.max() + columns.min()) / 2
-            reach_px = torch.hypot(rows - middle_r, columns - middle_c).max()
-            depth = project(camera, at)[1]
-            widths.append(float(reach_px * depth / camera.intrinsics[0, 0]))
-    return max(widths) if widths else 0.6 * scene.region_radius
+    return torch.maximum(ball_behind(scene, radius, nodes), least_distance(scene, nodes))
 
 
 def fit_level(
-    scene: Measurements, before: Float[Tensor, "nodes nodes nodes"], rounds: int, config: LinearConfig
+    scene: Measurements,
+    before: Float[Tensor, "nodes nodes nodes"],
+    radius: float,
+    rounds: int,
+    config: LinearConfig,
 ) -> Float[Tensor, "nodes nodes nodes"]:
     """The smoothest field near the points' planes that silhouettes allow, else like the level before.
 
-    Smooth is measured against a ball, whose curvature is free. Free space (f > 0) and silhouettes
+    Smooth is measured against the ball behind, whose curvature is free. Free space (f > 0) and silhouettes
     (f < 0 somewhere on each ray) are inequalities: they pull only where the field says otherwise, which
     takes a few rounds.
     """
@@ -111,10 +63,11 @@ def fit_level(
     points = merged_points(scene.positions, scene.normals, scene.confidence**3, h / 2)
     measured = point_distances(*points, nodes)
     measured_weight = measured.weight.clamp(max=4.0)
-    ball = _ball_behind(scene, nodes)
-    outside = _free_distance(scene, nodes)
+    ball = ball_behind(scene, radius, nodes)
+    bound = least_distance(scene, nodes)
+    outside = torch.where(bound > 0, bound, -math.inf)
     through = _seen_through_any(scene, nodes, 3 * h)
-    missed = torch.zeros((nodes**3, 2), device=before.device)
+    through_subject, pulled = silhouette_rays(scene, bound), torch.zeros((nodes**3, 2), device=before.device)
     rays, nearest = rim_rays(scene, nodes), cKDTree(points[0].cpu().numpy())
     distance = before
     for _ in range(rounds):
@@ -123,8 +76,8 @@ def fit_level(
         target[carved], weight[carved] = outside[carved], config.free_space
         carved = through & (distance < 2 * h)
         target[carved], weight[carved] = 2 * h, config.seen_through
-        missed = _FADE * missed + splat(*_missed_silhouettes(scene, distance), nodes)
-        rays_near, depths = missed.reshape(*distance.shape, 2).unbind(-1)
+        pulled = _FADE * pulled + _pulls(through_subject, distance)
+        rays_near, depths = pulled.reshape(*distance.shape, 2).unbind(-1)
         pull = config.silhouettes * rays_near.clamp(max=1.0) * (outside < 0)
         inside = depths / rays_near.clamp(min=1e-6)
         rims = _rim_distances(scene, rays, distance, nearest, config.rims)
@@ -136,6 +89,16 @@ def fit_level(
             target / total - ball, total, distance - ball, smoothness=config.smoothness, steps=30
         )
     return distance
+
+
+def _pulls(rays: SilhouetteRays, distance: Float[Tensor, "nodes nodes nodes"]) -> Float[Tensor, "cells 2"]:
+    """At the nodes around the middles of rays that miss the field: 1 for each, and how deep it should be."""
+    missed = missing(rays, distance)
+    depth = rays.depth[missed]
+    nodes = distance.shape[0]
+    return splat(
+        torch.stack([torch.ones_like(depth), depth], dim=-1), locate(rays.middle[missed], nodes), nodes
+    )
 
 
 def _rim_distances(
@@ -152,68 +115,8 @@ def _rim_distances(
     positions, normals = rim_points(rays, distance)
     apart, _ = measured.query(positions.cpu().numpy(), workers=-1)
     apart = torch.tensor(apart, dtype=positions.dtype, device=positions.device)
-    doubt = (1 - _depth_is_bounded(scene)) * (1 + (apart / _RIM_REACH).square())
+    doubt = (1 - depth_is_bounded(scene)) * (1 + (apart / _RIM_REACH).square())
     return point_distances(positions, normals, weight * torch.exp(-doubt), distance.shape[0])
-
-
-def _missed_silhouettes(
-    scene: Measurements, distance: Float[Tensor, "nodes nodes nodes"]
-) -> tuple[Float[Tensor, "rays 2"], Corners]:
-    """Rays through masks that miss the field's inside, and the places where they come nearest to it.
-
-    For each 1, and how deep inside it should be there: as far as from the outline, but not more than a cell.
-    """
-    nodes = distance.shape[0]
-    places, depths = [scene.positions[:0]], [scene.confidence[:0]]
-    for camera, outline in zip(scene.cameras, scene.certain, strict=True):
-        if outline is None:
-            continue
-        step = half_cell_px(camera, nodes)
-        rows, columns = torch.nonzero(outline[::step, ::step] < -0.5 * step, as_tuple=True)
-        pixels = torch.stack([columns, rows], dim=-1) * step + 0.5
-        directions = F.normalize(ray_directions(camera, pixels), dim=-1)
-        meets = _meets_region(scene, camera, directions)
-        directions, rows, columns = directions[meets], rows[meets], columns[meets]
-        origins = camera.position.expand_as(directions)
-        crossing = first_crossing(
-            lambda x: read(distance, x),
-            origins,
-            directions,
-            sphere_entry(origins / 1.75, directions) * 1.75,
-            reach=3.5,
-            shortest=0.5 * spacing(nodes),
-            steps=48,
-        )
-        missed = ~crossing.hit
-        places.append((origins + crossing.along[:, None] * directions)[missed])
-        inside_px = -outline[rows[missed] * step, columns[missed] * step]
-        depths.append(inside_px * crossing.along[missed] / camera.intrinsics[0, 0])
-    depth = torch.cat(depths).clamp(max=spacing(nodes))
-    return torch.stack([torch.ones_like(depth), depth], dim=-1), locate(torch.cat(places), nodes)
-
-
-def _meets_region(
-    scene: Measurements, camera: Pinhole, directions: Float[Tensor, "rays 3"]
-) -> Bool[Tensor, "rays"]:
-    """Rays that go through the region's inner nine tenths."""
-    apart = scene.region_centre - camera.position
-    along = directions @ apart
-    closest = (apart - along[:, None] * directions).norm(dim=-1)
-    meets: Bool[Tensor, "rays"] = (closest < 0.9 * scene.region_radius) & (along > 0)
-    return meets
-
-
-def _free_distance(scene: Measurements, nodes: int) -> Float[Tensor, "nodes nodes nodes"]:
-    """A lower bound of the distance: > 0 off any silhouette, before any empty backdrop and outside the
-    region; else no bound."""
-    points = node_positions(nodes, scene.positions.device)
-    bound = (points - scene.region_centre).norm(dim=-1) - 0.97 * scene.region_radius
-    bound = torch.maximum(bound, points.abs().amax(dim=-1) - (1 - spacing(nodes)))
-    for camera, outline, backdrop in zip(scene.cameras, scene.outlines, scene.backdrops, strict=True):
-        edge = outline if outline is not None else backdrop
-        if edge is not None:
-            bound = torch.maximum(bound, off_silhouette(camera, edge, nodes))
-    return torch.where(bound > 0, bound, -math.inf)
 
 
 def _seen_through_any(scene: Measurements, nodes: int, margin: float) -> Bool[Tensor, "nodes nodes nodes"]:

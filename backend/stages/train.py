@@ -7,7 +7,7 @@ the photographs (render_fit).
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
@@ -18,13 +18,19 @@ from ..errors import ErrorCode, ReconstructionError
 from ..maths.grid import refined, spacing
 from ..scene import Decision, Progress, Region, View, to_unit_sphere, within
 from .deadline import Clock, GridCost, deadline_after, finest_grid, predicted_s
-from .linear_fit import LinearConfig, fit_level, start, widest_angle_deg
+from .linear_fit import LinearConfig, fit_level, start
 from .measurements import Measurements, measurements
 from .render_fit import RenderConfig, refine
+from .silhouettes import least_distance, missing, silhouette_rays
 from .stereo import StereoResult
+from .unseen_side import DEEPEST, explained_radius, widest_angle_deg
 
 COARSEST = 48
 """Nodes along each axis of the grid that finds the surface's extent."""
+_TRIAL_ROUNDS = 6
+"""Of the fits that find how deep the subject is."""
+_MARGIN = 1.2
+"""How much deeper than the least that silhouettes ask for."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -84,12 +90,13 @@ def fit_surface(
     progress(0.0, "finding the extent of the surface")
     with torch.no_grad():
         scene = measurements(views, region, region, stereo, device)
+        radius = _radius_behind(scene, config.linear)
         began_s = clock()
-        distance = fit_level(scene, start(scene, COARSEST), config.rounds[0], config.linear)
+        distance = fit_level(scene, start(scene, radius, COARSEST), radius, config.rounds[0], config.linear)
         frame = _tight_frame(distance, region)
         costs = [GridCost(nodes=COARSEST, seconds=clock() - began_s)]
         scene = measurements(views, region, frame, stereo, device)
-        distance = start(scene, config.levels[0])
+        distance = start(scene, radius, config.levels[0])
     total = sum(config.steps) + 10 * len(config.levels)
     done, rendered = 0, 0
     for wanted, rounds, steps in zip(config.levels, config.rounds, config.steps, strict=True):
@@ -99,7 +106,7 @@ def fit_surface(
         progress(done / total, f"fitting points on a grid of {nodes}^3")
         began_s = clock()
         with torch.no_grad():
-            distance = fit_level(scene, refined(distance, nodes), rounds, config.linear)
+            distance = fit_level(scene, refined(distance, nodes), radius, rounds, config.linear)
         done += 10
         show(Surface(distance=distance.cpu().numpy(), grid_from_world=frame.object_from_world))
         costs.append(GridCost(nodes=nodes, seconds=clock() - began_s))
@@ -113,6 +120,27 @@ def fit_surface(
         used_s = config.budget_s - deadline.left_s()
         made = (*made, _of_budget(config.budget_s, used_s, config, costs, rendered))
     return Surface(distance=distance.cpu().numpy(), grid_from_world=frame.object_from_world, decisions=made)
+
+
+def _radius_behind(scene: Measurements, config: LinearConfig) -> float:
+    """Of the ball behind, in half widths of the subject: with which silhouettes are met of their own accord.
+
+    Rays through the subject that miss a surface fitted without them say that it goes on, farther back.
+    """
+    alone = replace(config, silhouettes=0.0)
+    rays = silhouette_rays(scene, least_distance(scene, COARSEST))
+
+    def num_missed(radius: float) -> int:
+        trial = fit_level(scene, start(scene, radius, COARSEST), radius, _TRIAL_ROUNDS, alone)
+        return int(missing(rays, trial).sum())
+
+    radius = explained_radius(scene)
+    tolerated = 1.1 * num_missed(DEEPEST) + 3
+    if num_missed(radius) <= tolerated:
+        return radius
+    while radius < DEEPEST and num_missed(radius) > tolerated:
+        radius = min(1.2 * radius, DEEPEST)
+    return min(_MARGIN * radius, DEEPEST)
 
 
 def _of_budget(

@@ -325,7 +325,7 @@ def fitted(azimuths_deg: list[float], rims: float) -> tuple[Measurements, Tensor
     facing = normals_at(points) @ F.normalize(torch.tensor([1.0, 0.2, 0.3]), dim=0)
     cameras = [camera_from(azimuth) for azimuth in azimuths_deg]
     scene = seen(cameras, [exact_edge(c) for c in cameras], measured=points[facing > 0.9])
-    return scene, fit_level(scene, start(scene, 24), 15, LinearConfig(rims=rims))
+    return scene, fit_level(scene, start(scene, 1.0, 24), 1.0, 15, LinearConfig(rims=rims))
 
 
 def distances_and_angles(distance: Tensor, points: Points) -> tuple[Tensor, Tensor]:

@@ -1,0 +1,101 @@
+"""What silhouettes say of a field: where there is nothing, and which rays must meet an inside."""
+
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from ..maths.evidence import half_cell_px, off_silhouette
+from ..maths.geometry import Pinhole, ray_directions
+from ..maths.grid import node_positions, read, spacing
+from ..maths.rays import first_crossing, sphere_entry
+from .measurements import Measurements
+
+_AROUND = 1.75
+"""Radius of a ball around the grid's cube."""
+
+
+def least_distance(scene: Measurements, nodes: int) -> Float[Tensor, "nodes nodes nodes"]:
+    """A bound that the distance is not below where it is > 0: off any silhouette, before any empty backdrop
+    and outside the region."""
+    points = node_positions(nodes, scene.positions.device)
+    bound = (points - scene.region_centre).norm(dim=-1) - 0.97 * scene.region_radius
+    bound = torch.maximum(bound, points.abs().amax(dim=-1) - (1 - spacing(nodes)))
+    for camera, outline, backdrop in zip(scene.cameras, scene.outlines, scene.backdrops, strict=True):
+        edge = outline if outline is not None else backdrop
+        if edge is not None:
+            bound = torch.maximum(bound, off_silhouette(camera, edge, nodes))
+    return bound
+
+
+@dataclass(frozen=True, kw_only=True)
+class SilhouetteRays:
+    """Rays through the subject; each must meet an inside somewhere."""
+
+    origins: Float[Tensor, "rays 3"]
+    directions: Float[Tensor, "rays 3"]
+    """Unit vectors."""
+    entry: Float[Tensor, "rays"]
+    """Where a ray comes near the grid, as far from its origin."""
+    middle: Float[Tensor, "rays 3"]
+    """Of the places on a ray that may be inside as far as all other silhouettes know."""
+    depth: Float[Tensor, "rays"]
+    """How deep inside the middle may be: as far as from the outline, but not more than a cell."""
+
+
+def silhouette_rays(scene: Measurements, bound: Float[Tensor, "nodes nodes nodes"]) -> SilhouetteRays:
+    """As many rays as the grid of `bound` (of least_distance) needs.
+
+    A ray on which nothing may be inside is contradicted by another photograph, and left out.
+    """
+    nodes = bound.shape[0]
+    none = scene.positions[:0]
+    parts = [[none, none, none[:, 0], none, none[:, 0]]]
+    for camera, outline in zip(scene.cameras, scene.certain, strict=True):
+        if outline is None:
+            continue
+        step = half_cell_px(camera, nodes)
+        rows, columns = torch.nonzero(outline[::step, ::step] < -0.5 * step, as_tuple=True)
+        pixels = torch.stack([columns, rows], dim=-1) * step + 0.5
+        directions = F.normalize(ray_directions(camera, pixels), dim=-1)
+        origins = camera.position.expand_as(directions)
+        entry = sphere_entry(origins / _AROUND, directions) * _AROUND
+        along = entry[:, None] + torch.linspace(0, 2 * _AROUND, 2 * nodes, device=entry.device)
+        points = origins[:, None] + along[..., None] * directions[:, None]
+        allowed = (read(bound, points.reshape(-1, 3)) < 0).reshape(along.shape).cumsum(dim=1)
+        middle = torch.searchsorted(allowed, (allowed[:, -1:] + 1) // 2)
+        chosen = _meets_region(scene, camera, directions) & (allowed[:, -1] > 0)
+        at = along.gather(1, middle.clamp(max=along.shape[1] - 1))[:, 0]
+        inside_px = -outline[rows * step, columns * step]
+        depth = (inside_px * at / camera.intrinsics[0, 0]).clamp(max=spacing(nodes))
+        part = [origins, directions, entry, origins + at[:, None] * directions, depth]
+        parts.append([column[chosen] for column in part])
+    origins, directions, entry, middle, depth = (torch.cat(column) for column in zip(*parts, strict=True))
+    return SilhouetteRays(origins=origins, directions=directions, entry=entry, middle=middle, depth=depth)
+
+
+def missing(rays: SilhouetteRays, distance: Float[Tensor, "nodes nodes nodes"]) -> Bool[Tensor, "rays"]:
+    """Rays that miss a field's inside."""
+    crossing = first_crossing(
+        lambda points: read(distance, points),
+        rays.origins,
+        rays.directions,
+        rays.entry,
+        reach=2 * _AROUND,
+        shortest=0.5 * spacing(distance.shape[0]),
+        steps=60,
+    )
+    return ~crossing.hit
+
+
+def _meets_region(
+    scene: Measurements, camera: Pinhole, directions: Float[Tensor, "rays 3"]
+) -> Bool[Tensor, "rays"]:
+    """Rays that go through the region's inner nine tenths."""
+    apart = scene.region_centre - camera.position
+    along = directions @ apart
+    closest = (apart - along[:, None] * directions).norm(dim=-1)
+    meets: Bool[Tensor, "rays"] = (closest < 0.9 * scene.region_radius) & (along > 0)
+    return meets

@@ -1,0 +1,74 @@
+"""What is assumed of the side that no photograph shows: a ball behind what was measured."""
+
+import math
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float
+from torch import Tensor
+
+from ..maths.geometry import project
+from ..maths.grid import node_positions
+from .measurements import Measurements
+
+LEAST_RADIUS = 0.3
+"""Of the ball, in half widths of the subject."""
+DEEPEST = 1.4
+"""The same, at most: as deep as the subject is across its diagonal."""
+
+
+def ball_behind(scene: Measurements, radius: float, nodes: int) -> Float[Tensor, "nodes nodes nodes"]:
+    """(|x - c|^2 - r^2) / 2r of the ball that touches the middle of the measured points from behind.
+
+    Its radius is given in half widths of the subject.
+    """
+    mean_p, mean_n = _middle(scene)
+    r = radius * _half_width(scene, mean_p)
+    apart = node_positions(nodes, scene.positions.device) - (mean_p - r * mean_n)
+    return (apart.square().sum(dim=-1) - r * r) / (2 * r)
+
+
+def explained_radius(scene: Measurements) -> float:
+    """All that measured points say of the ball's radius, in half widths of the subject; at most 1.
+
+    Least squares of p = c + r n over points and normals: for points all around it is the object's size,
+    for points on one side what the turning of their normals says. Where the photographs are taken from
+    sides far enough apart for silhouettes to bound the depth, it is as large as the subject is wide.
+    """
+    mean_p, mean_n = _middle(scene)
+    weight = (scene.confidence / scene.confidence.sum())[:, None]
+    spread = (weight * (scene.normals - mean_n).square()).sum()
+    together = (weight * (scene.positions - mean_p) * (scene.normals - mean_n)).sum()
+    turning = float(together / spread.clamp(min=1e-6)) / _half_width(scene, mean_p)
+    explained = min(max(turning, LEAST_RADIUS), 1.0)
+    return explained + depth_is_bounded(scene) * (1 - explained)
+
+
+def _middle(scene: Measurements) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"]]:
+    """Weighted mean of the points' positions and of their normals."""
+    weight = (scene.confidence / scene.confidence.sum())[:, None]
+    return (weight * scene.positions).sum(dim=0), (weight * scene.normals).sum(dim=0)
+
+
+def widest_angle_deg(scene: Measurements) -> float:
+    """Largest angle between two cameras, seen from the region's middle."""
+    directions = F.normalize(torch.stack([c.position for c in scene.cameras]) - scene.region_centre, dim=-1)
+    return math.degrees(math.acos(float((directions @ directions.T).min().clamp(-1, 1))))
+
+
+def depth_is_bounded(scene: Measurements) -> float:
+    """Whether silhouettes bound the depth: 0 if the photographs are taken from one side, 1 if from many."""
+    return min(max((widest_angle_deg(scene) - 50) / 40, 0.0), 1.0)
+
+
+def _half_width(scene: Measurements, at: Float[Tensor, "3"]) -> float:
+    """Largest half extent of the subject across the views, at the distance of a point of it."""
+    widths = []
+    for camera, outline in zip(scene.cameras, scene.outlines, strict=True):
+        if outline is not None:
+            rows, columns = torch.nonzero(outline < 0, as_tuple=True)
+            middle_r, middle_c = (rows.max() + rows.min()) / 2, (columns.max() + columns.min()) / 2
+            reach_px = torch.hypot(rows - middle_r, columns - middle_c).max()
+            depth = project(camera, at)[1]
+            widths.append(float(reach_px * depth / camera.intrinsics[0, 0]))
+    return max(widths) if widths else 0.6 * scene.region_radius
