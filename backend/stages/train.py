@@ -115,7 +115,7 @@ def fit_surface(
             distance, taken = refine(scene, distance, steps, config.render, generator, tell, deadline)
             rendered += taken
             done += steps
-    made = _decisions(scene, frame, config, nodes=len(distance), rendered=rendered)
+    made = _decisions(scene, frame, config, radius=radius, nodes=len(distance), rendered=rendered)
     if config.budget_s is not None:
         used_s = config.budget_s - deadline.left_s()
         made = (*made, _of_budget(config.budget_s, used_s, config, costs, rendered))
@@ -160,12 +160,11 @@ def _of_budget(
 
 
 def _decisions(
-    scene: Measurements, frame: Region, config: TrainConfig, *, nodes: int, rendered: int
+    scene: Measurements, frame: Region, config: TrainConfig, *, radius: float, nodes: int, rendered: int
 ) -> tuple[Decision, ...]:
     """What was modelled and what was left out, with the measurement behind it."""
     masks = sum(outline is not None for outline in scene.outlines)
     backdrops = sum(backdrop is not None for backdrop in scene.backdrops)
-    angle_deg = widest_angle_deg(scene)
     cell = spacing(nodes) * frame.radius_world
     as_asked = nodes == config.levels[-1] and rendered == sum(config.steps)
     asked = "the preset" if as_asked else "the time given"
@@ -182,8 +181,8 @@ def _decisions(
         ),
         Decision(
             what="depth of the unseen side",
-            choice="as deep as wide" if angle_deg > 90 else "continued from the measured curvature",
-            because=f"the photographs are taken from sides up to {angle_deg:.0f} degrees apart",
+            choice=f"a ball of {radius:.2f} half widths of the subject behind what was measured",
+            because=_why_so_deep(scene, radius),
         ),
         Decision(what="background", choice="left out", because="rays that miss the subject are not rendered"),
         Decision(
@@ -193,6 +192,15 @@ def _decisions(
         ),
     ]
     return tuple(made)
+
+
+def _why_so_deep(scene: Measurements, radius: float) -> str:
+    angle_deg = widest_angle_deg(scene)
+    taken = f"the photographs are taken from sides up to {angle_deg:.0f} degrees apart"
+    explained = explained_radius(scene)
+    if radius > explained:
+        return f"{taken}; with the {explained:.2f} that measured points ask for, silhouettes were missed"
+    return taken if angle_deg > 90 else f"{taken}; so turn the normals of the measured points"
 
 
 def _tight_frame(distance: Float[Tensor, "nodes nodes nodes"], region: Region) -> Region:

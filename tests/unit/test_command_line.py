@@ -1,5 +1,6 @@
 """What the words of the command line become."""
 
+import os
 from pathlib import Path
 from typing import Any
 
@@ -90,3 +91,13 @@ def test_a_rehearsal_gets_its_length_and_end(monkeypatch: pytest.MonkeyPatch) ->
         (None, {"seconds": 1.0, "end": "finished"}),
         (Path("o"), {"seconds": 3.0, "end": "crashed"}),
     ]
+
+
+def test_threads_that_wait_sleep_unless_the_user_says_otherwise(monkeypatch: pytest.MonkeyPatch) -> None:
+    for before, after in ((None, "PASSIVE"), ("ACTIVE", "ACTIVE")):
+        monkeypatch.setenv("OMP_WAIT_POLICY", before or "")
+        if before is None:
+            monkeypatch.delenv("OMP_WAIT_POLICY")
+        with pytest.raises(SystemExit):
+            program.main(["--help"])
+        assert os.environ["OMP_WAIT_POLICY"] == after

@@ -336,19 +336,19 @@ def distances_and_angles(distance: Tensor, points: Points) -> tuple[Tensor, Tens
 
 
 def test_rims_hold_the_surface_where_nothing_is_measured() -> None:
-    """Three sides: without rims the flat body sinks between them, being smooth; with them at most swells."""
+    """Three sides: silhouettes alone let the flat body sink and swell between; rims hold it."""
     scene, without = fitted([-60, 0, 60], 0.0)
     _, with_rims = fitted([-60, 0, 60], 0.1)
     touching = torch.cat([touching_points(camera, 300) for camera in scene.cameras])
     around = F.normalize(torch.randn(3000, 3, generator=torch.Generator().manual_seed(1)), dim=-1)
     everywhere = MIDDLE + around @ SHAPE.T
-    for points, better, turned in ((touching, 0.35, 0.6), (everywhere, 0.6, 0.8)):
+    for points, cells, degrees in ((touching, 0.07, 5.0), (everywhere, 0.16, 7.0)):
         (before, before_deg), (after, after_deg) = (
             distances_and_angles(f, points) for f in (without, with_rims)
         )
-        assert after.abs().mean() < better * before.abs().mean()
-        assert after_deg.mean() < turned * before_deg.mean()
-    assert after.abs().mean() < 0.25, "cells"
+        assert after.abs().mean() < min(cells, 0.7 * before.abs().mean())
+        assert after_deg.mean() < min(degrees, 0.9 * before_deg.mean())
+        assert before.abs().mean() < 0.3, "cells: silhouettes are met also without rims"
 
 
 def test_from_one_side_rims_say_little_where_nothing_is_measured_near() -> None:

@@ -1,0 +1,162 @@
+"""Capsules before cameras: where silhouettes let them be, which rays miss a field, and how deep they are."""
+
+import math
+from itertools import pairwise
+
+import numpy as np
+import pytest
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float
+from scipy.ndimage import distance_transform_edt
+from torch import Tensor
+
+from backend.maths.geometry import Pinhole, pixel_centres, ray_directions
+from backend.maths.grid import node_positions, spacing
+from backend.maths.rays import first_crossing
+from backend.stages.linear_fit import LinearConfig
+from backend.stages.measurements import Measurements
+from backend.stages.silhouettes import least_distance, missing, silhouette_rays
+from backend.stages.train import _radius_behind
+from backend.stages.unseen_side import DEEPEST, ball_behind, explained_radius
+
+CPU = torch.device("cpu")
+SIZE = 160
+RADIUS = 0.25
+Points = Float[Tensor, "points 3"]
+
+
+def capsule(points: Float[Tensor, "*batch 3"], back: float) -> Float[Tensor, "*batch"]:
+    """Signed distance of a capsule along x, from x = 0.4 backwards to `back`."""
+    axis = torch.zeros_like(points)
+    axis[..., 0] = points[..., 0].clamp(back, 0.4)
+    distance: Tensor = (points - axis).norm(dim=-1) - RADIUS
+    return distance
+
+
+def camera_from(azimuth_deg: float) -> Pinhole:
+    """Four units before the capsule's front, a little above."""
+    azimuth = math.radians(azimuth_deg)
+    position = 4 * F.normalize(torch.tensor([math.cos(azimuth), math.sin(azimuth), 0.3]), dim=0)
+    forward = -F.normalize(position, dim=0)
+    right = F.normalize(torch.linalg.cross(forward, torch.tensor([0.0, 0.0, 1.0])), dim=0)
+    camera_from_object = torch.eye(4)
+    camera_from_object[:3, :3] = torch.stack([right, torch.linalg.cross(forward, right), forward])
+    camera_from_object[:3, 3] = -camera_from_object[:3, :3] @ position
+    intrinsics = torch.tensor([[300.0, 0, SIZE / 2], [0, 300.0, SIZE / 2], [0, 0, 1]])
+    return Pinhole(intrinsics=intrinsics, camera_from_object=camera_from_object, width=SIZE, height=SIZE)
+
+
+def outline(camera: Pinhole, back: float) -> Float[Tensor, "height width"]:
+    """Signed distance to the capsule's outline in pixels, > 0 off it."""
+    directions = F.normalize(ray_directions(camera, pixel_centres(SIZE, SIZE, CPU)), dim=-1).reshape(-1, 3)
+    origins = camera.position.expand_as(directions)
+    start = torch.full_like(directions[:, 0], 2.0)
+    crossing = first_crossing(lambda x: capsule(x, back), origins, directions, start, reach=4.0, steps=200)
+    on = crossing.hit.reshape(SIZE, SIZE).numpy()
+    signed = distance_transform_edt(~on) - distance_transform_edt(on)
+    return torch.tensor(signed - 0.5 * np.sign(signed), dtype=torch.float32)
+
+
+def seen(azimuths_deg: list[float], back: float, *, measured_from: float = 0.4) -> Measurements:
+    """The capsule's silhouettes, and points of it whose x is more than so much."""
+    u = F.normalize(torch.randn(4000, 3, generator=torch.Generator().manual_seed(0)), dim=-1)
+    positions = u * RADIUS
+    positions[:, 0] += torch.where(u[:, 0] > 0, 0.4, 0.4 + 2 * u[:, 0] * (0.4 - back))
+    chosen = (positions[:, 0] > measured_from) & (positions[:, 0] > back)
+    # beside the caps the surface is a tube
+    normals = torch.where(u[:, :1] > 0, u, F.normalize(u * torch.tensor([0.0, 1.0, 1.0]), dim=-1))
+    axis = torch.zeros_like(positions)
+    axis[:, 0] = positions[:, 0].clamp(max=0.4)
+    positions = axis + RADIUS * normals
+    cameras = [camera_from(azimuth) for azimuth in azimuths_deg]
+    edges = [outline(camera, back) for camera in cameras]
+    count = int(chosen.sum())
+    return Measurements(
+        cameras=cameras,
+        images=[torch.zeros(3, SIZE, SIZE)] * len(cameras),
+        masks=[None] * len(cameras),
+        outlines=list(edges),
+        backdrops=[None] * len(cameras),
+        certain=list(edges),
+        depths=[torch.zeros(SIZE, SIZE)] * len(cameras),
+        positions=positions[chosen],
+        normals=normals[chosen],
+        colours=torch.zeros(count, 3),
+        confidence=torch.ones(count),
+        region_centre=torch.zeros(3),
+        region_radius=1.0,
+    )
+
+
+NODES = 48
+
+
+def test_nothing_is_bounded_away_from_the_body() -> None:
+    scene = seen([-20.0, 0.0, 20.0], -0.5)
+    bound = least_distance(scene, NODES)
+    distance = capsule(node_positions(NODES, CPU), -0.5)
+    assert (bound <= distance.clamp(min=0) + spacing(NODES)).all()
+    assert (bound > 0).float().mean() > 0.8
+
+
+def test_the_middle_of_a_ray_lies_where_no_silhouette_forbids_it() -> None:
+    scene = seen([-20.0, 0.0, 20.0], -0.5)
+    rays = silhouette_rays(scene, least_distance(scene, NODES))
+    on = sum(int((edge < 0).sum()) for edge in scene.outlines if edge is not None)
+    assert len(rays.origins) > 0.1 * on
+    for camera, edge in zip(scene.cameras, scene.outlines, strict=True):
+        assert edge is not None
+        homogeneous = rays.middle @ camera.camera_from_object[:3, :3].T + camera.camera_from_object[:3, 3]
+        pixels = (homogeneous @ camera.intrinsics.T)[:, :2] / homogeneous[:, 2:]
+        column, row = pixels.long().clamp(0, SIZE - 1).T
+        assert (edge[row, column] < 2.5).all(), "a cell is about three pixels"
+    assert (rays.depth > 0).all()
+    assert (rays.depth <= spacing(NODES)).all()
+
+
+def test_a_ray_that_another_photograph_contradicts_is_left_out() -> None:
+    scene = seen([-20.0, 20.0], -0.5)
+    num_rays = len(silhouette_rays(scene, least_distance(scene, NODES)).origins)
+    nothing = torch.full((SIZE, SIZE), 50.0)
+    nothing[:4, :4] = -1
+    scene.outlines[1] = scene.certain[1] = nothing
+    assert num_rays > 200
+    assert len(silhouette_rays(scene, least_distance(scene, NODES)).origins) < 0.02 * num_rays
+
+
+def test_no_ray_misses_the_body_itself_and_all_miss_what_is_not_there() -> None:
+    scene = seen([-20.0, 0.0, 20.0], -0.5)
+    rays = silhouette_rays(scene, least_distance(scene, NODES))
+    distance = capsule(node_positions(NODES, CPU), -0.5)
+    assert missing(rays, distance).float().mean() < 0.01
+    assert missing(rays, distance.abs() + 0.01).all()
+
+
+def test_no_ray_leaps_over_a_small_ball() -> None:
+    """(|x - c|^2 - r^2) / 2r grows with |x|^2 / 2r: a step of its value would end far behind the ball."""
+    scene = seen([-20.0, 0.0, 20.0], 0.3)
+    rays = silhouette_rays(scene, least_distance(scene, NODES))
+    ball = ball_behind(scene, 0.3, NODES)
+    positions = node_positions(NODES, CPU)[ball < 0]
+    towards = F.normalize(positions.mean(dim=0) - rays.origins, dim=-1)
+    through = (towards * rays.directions).sum(dim=-1) > math.cos(0.01)
+    assert ball.max() > 5
+    assert through.sum() > 5
+    assert not missing(rays, ball)[through].any()
+
+
+@pytest.mark.parametrize("measured_from", [0.4, 0.3])
+def test_the_ball_behind_grows_with_what_only_silhouettes_show(measured_from: float) -> None:
+    """Of a long body only the front is measured: its sides show in the outer photographs."""
+    azimuths = [-20.0, 0.0, 20.0]
+    radii = []
+    for back in (0.2, -0.9):
+        scene = seen(azimuths, back, measured_from=measured_from)
+        radii.append(_radius_behind(scene, LinearConfig()))
+    short, long = radii
+    assert short == pytest.approx(explained_radius(seen(azimuths, 0.2, measured_from=measured_from)))
+    assert long > 1.5 * short
+    assert long <= DEEPEST
+    for one, other in pairwise(radii):
+        assert one < other
