@@ -24,12 +24,13 @@ from .presets import Settings
 from .previews import Previews
 from .results import cameras_summary, summary, write_all, write_cameras
 from .scene import Decision, Photo, Region, SolvedCameras, SurfaceMesh
+from .stages.camera_refinement import match_solved, with_refined
 from .stages.cameras import solve_cameras
 from .stages.mesh import extract_mesh
 from .stages.photos import load_photos
 from .stages.region import find_region
 from .stages.report import Report, ReportInputs, StageTiming, build_report
-from .stages.stereo import StereoResult, match_views
+from .stages.stereo import StereoResult
 from .stages.train import Surface, fit_surface
 from .version import VERSION
 from .workspace import StageCost, Workspace, check_free_space, fingerprint
@@ -75,7 +76,7 @@ class Stages:
     load_photos: Callable[..., tuple[Photo, ...]] = load_photos
     solve_cameras: Callable[..., SolvedCameras] = solve_cameras
     find_region: Callable[..., Region] = find_region
-    match_views: Callable[..., StereoResult] = match_views
+    match_views: Callable[..., StereoResult] = match_solved
     fit_surface: Callable[..., Surface] = fit_surface
     extract_mesh: Callable[..., SurfaceMesh] = extract_mesh
     build_report: Callable[..., Report] = build_report
@@ -221,10 +222,12 @@ def _reconstructed(
 ) -> ReportInputs:
     """The mesh, with all that the report tells of it."""
     solved, region, device = placed
-    views = solved.views
     previews = Previews(this.workspace, this.listener.previewed)
     previews.show_cameras(solved, region)
-    stereo = this.stage("stereo", partial(stages.match_views, views, region, settings.stereo, device=device))
+    match = partial(stages.match_views, solved, region, settings.stereo, device=device)
+    stereo = this.stage("stereo", match)
+    solved = with_refined(solved, stereo)
+    views = solved.views
     previews.show_points(stereo.points, region)
     chance = {"device": device, "generator": torch.Generator(device).manual_seed(job.seed)}
     show = partial(previews.show_surface, points=stereo.points, region=region)

@@ -21,7 +21,7 @@ from ..errors import ErrorCode, ReconstructionError
 from ..maths.backdrop import find_backdrop
 from ..maths.geometry import pinhole_in_object, pixel_centres, sample_image, unproject
 from ..maths.inverse_depth import fit_planes, normals_from_planes
-from ..scene import Decision, Progress, Region, SurfacePoints, View, within
+from ..scene import Camera, Decision, Progress, Region, SurfacePoints, View, within
 from .depth_maps import Measured, depth_maps
 from .stereo_config import StereoConfig
 from .stereo_windows import neighbours, pyramid, sees_region
@@ -47,6 +47,8 @@ class StereoResult:
 
     points: SurfacePoints
     depth_maps: tuple[DepthMap, ...]
+    refined_cameras: tuple[Camera, ...] | None = None
+    """One per view; None where those that stereo was given are as good."""
     decisions: tuple[Decision, ...] = ()
 
 

@@ -29,7 +29,7 @@ COARSEST = 48
 """Nodes along each axis of the grid that finds the surface's extent."""
 _TRIAL_ROUNDS = 6
 """Of the fits that find how deep the subject is."""
-_MARGIN = 1.2
+_MARGIN = 1.4
 """How much deeper than the least that silhouettes ask for."""
 
 

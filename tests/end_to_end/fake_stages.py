@@ -39,6 +39,7 @@ from backend.stages.train import ShowSurface, Surface
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class FakeStereo:
     points: SurfacePoints
+    refined_cameras: tuple[Camera, ...] | None = None
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -118,7 +119,7 @@ def find_region(_solved: SolvedCameras, config: RegionConfig, *, progress: Progr
 
 
 def match_views(
-    _views: tuple[View, ...], _region: Region, _config: Any, *, device: torch.device, progress: Progress
+    _solved: SolvedCameras, _region: Region, _config: Any, *, device: torch.device, progress: Progress
 ) -> FakeStereo:
     assert device.type == "cpu"
     work("stereo", progress)
