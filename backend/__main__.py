@@ -4,7 +4,6 @@ import argparse
 import faulthandler
 import logging
 import math
-import os
 import sys
 from pathlib import Path
 from typing import Any
@@ -15,6 +14,7 @@ from .commands.benchmark import add_benchmark, benchmark, positive_seconds
 from .commands.doctor import doctor_on_wire
 from .commands.reconstruct import EXIT_FINE, EXIT_USER_ERROR, on_terminal, on_wire
 from .commands.rehearse import rehearse
+from .waiting import set_waiting_policy
 from .wire.environment import BUILDS
 from .wire.protocol import DEVICES, PRESETS, PROTOCOL_VERSION, Job
 
@@ -24,9 +24,7 @@ _JOB_OPTIONS = ("output", "cameras", "masks", "preset", "device", "seed", "truth
 def main(arguments: list[str] | None = None) -> int:
     """Run a command; the exit code: 0 fine, 1 a fault of the program, 2 of the input, 130 stopped."""
     faulthandler.enable()
-    # Before torch is loaded: its threads sleep where they wait. Spinning, as they would, they keep a core
-    # from each other on a busy machine, and all takes ten times as long.
-    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+    set_waiting_policy()
     logging.basicConfig(level=logging.WARNING, stream=sys.stderr)
     logging.getLogger("backend").setLevel(logging.INFO)
     logging.getLogger().handlers[0].setLevel(logging.WARNING)

@@ -1,5 +1,5 @@
-"""Before torch is loaded: as the command line sets it, for machines that do something else meanwhile."""
+"""Before torch is loaded."""
 
-import os
+from backend.waiting import set_waiting_policy
 
-os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+set_waiting_policy()

@@ -93,11 +93,17 @@ def test_a_rehearsal_gets_its_length_and_end(monkeypatch: pytest.MonkeyPatch) ->
     ]
 
 
-def test_threads_that_wait_sleep_unless_the_user_says_otherwise(monkeypatch: pytest.MonkeyPatch) -> None:
-    for before, after in ((None, "PASSIVE"), ("ACTIVE", "ACTIVE")):
-        monkeypatch.setenv("OMP_WAIT_POLICY", before or "")
-        if before is None:
-            monkeypatch.delenv("OMP_WAIT_POLICY")
-        with pytest.raises(SystemExit):
-            program.main(["--help"])
-        assert os.environ["OMP_WAIT_POLICY"] == after
+@pytest.mark.parametrize(
+    ("load", "chosen", "expected"),
+    [(0.1, None, None), (8.0, None, "PASSIVE"), (8.0, "ACTIVE", "ACTIVE"), (0.1, "PASSIVE", "PASSIVE")],
+)
+def test_threads_that_wait_sleep_where_the_computer_is_busy(
+    monkeypatch: pytest.MonkeyPatch, load: float, chosen: str | None, expected: str | None
+) -> None:
+    environment = {} if chosen is None else {"OMP_WAIT_POLICY": chosen}
+    monkeypatch.setattr(os, "environ", environment)
+    monkeypatch.setattr(os, "getloadavg", lambda: (load, load, load), raising=False)
+    monkeypatch.setattr(os, "cpu_count", lambda: 4)
+    monkeypatch.setattr(program, "run", lambda _arguments: 0)
+    program.main([])
+    assert environment.get("OMP_WAIT_POLICY") == expected
