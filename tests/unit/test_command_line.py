@@ -7,6 +7,7 @@ from typing import Any
 import pytest
 
 import backend.__main__ as program
+from backend import waiting
 from backend.commands.install import Plan
 from backend.commands.reconstruct import settings_of
 from backend.wire.protocol import Job
@@ -94,15 +95,17 @@ def test_a_rehearsal_gets_its_length_and_end(monkeypatch: pytest.MonkeyPatch) ->
 
 
 @pytest.mark.parametrize(
-    ("load", "chosen", "expected"),
-    [(0.1, None, None), (8.0, None, "PASSIVE"), (8.0, "ACTIVE", "ACTIVE"), (0.1, "PASSIVE", "PASSIVE")],
+    ("running", "chosen", "expected"),
+    [(1, None, None), (9, None, "PASSIVE"), (9, "ACTIVE", "ACTIVE"), (1, "PASSIVE", "PASSIVE")],
 )
 def test_threads_that_wait_sleep_where_the_computer_is_busy(
-    monkeypatch: pytest.MonkeyPatch, load: float, chosen: str | None, expected: str | None
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, running: int, chosen: str | None, expected: str | None
 ) -> None:
+    load = tmp_path / "loadavg"
+    load.write_text(f"5.00 5.00 5.00 {running}/250 4711\n", encoding="ascii")
     environment = {} if chosen is None else {"OMP_WAIT_POLICY": chosen}
+    monkeypatch.setattr(waiting, "_LOAD", load)
     monkeypatch.setattr(os, "environ", environment)
-    monkeypatch.setattr(os, "getloadavg", lambda: (load, load, load), raising=False)
     monkeypatch.setattr(os, "cpu_count", lambda: 4)
     monkeypatch.setattr(program, "run", lambda _arguments: 0)
     program.main([])
