@@ -14,7 +14,7 @@ def set_waiting_policy() -> None:
 
     They spin while they wait. On an idle computer that is best (sleeping makes a run 1.7 times as long). On a
     busy one they keep each other from the cores, and a fit took five times as long as with sleeping threads.
-    Only Linux is asked: the threads of other systems' torch give way by themselves.
+    Only Linux is asked: elsewhere nothing was measured.
     """
     if _LOAD.exists() and _others_running() >= max(1, (os.cpu_count() or 1) / 4):
         os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
