@@ -16,8 +16,10 @@ def set_waiting_policy() -> None:
     busy one they keep each other from the cores, and a fit took five times as long as with sleeping threads.
     Only Linux is asked: elsewhere nothing was measured.
     """
-    if _LOAD.exists() and _others_running() >= max(1, (os.cpu_count() or 1) / 4):
-        os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+    if "OMP_WAIT_POLICY" in os.environ or not _LOAD.exists():
+        return
+    if _others_running() >= max(1, (os.cpu_count() or 1) / 4):
+        os.environ["OMP_WAIT_POLICY"] = "PASSIVE"
 
 
 def _others_running() -> float:

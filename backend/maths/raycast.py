@@ -13,7 +13,8 @@ from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 from jaxtyping import Bool, Float, Float32, Float64, Int, Int64
 
-from ..scene import Camera, SurfaceMesh, transform_points
+from ..scene import Camera, SurfaceMesh
+from .projection import in_picture
 
 GRAZING_COSINE = 0.05
 """A surface seen at a smaller cosine (87 degrees off its normal) shows too few pixels to count as seen."""
@@ -210,13 +211,3 @@ def visible_from(
         covered = caster.blocked(lifted[candidates], ray / reach[:, None], reach)
         seen[candidates[~covered], column] = True
     return seen
-
-
-def in_picture(points: Float[np.ndarray, "points 3"], camera: Camera) -> Bool[np.ndarray, "points"]:
-    """True where a point lies in front of the camera and within its picture's edges."""
-    x, y, z = transform_points(camera.camera_from_world, points).T
-    front = z > 0
-    depth = np.where(front, z, 1.0)
-    column, row = camera.fx_px * x / depth + camera.cx_px, camera.fy_px * y / depth + camera.cy_px
-    inside = (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
-    return np.asarray(front & inside)

@@ -5,8 +5,8 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Bool, Float64, UInt8
 
-from ..scene import View, transform_points
-from .raycast import in_picture
+from ..scene import View
+from .projection import in_picture, projected
 
 _UNSEEN_GREY = 128
 
@@ -16,8 +16,7 @@ def colours_at(view: View, points: Float64[np.ndarray, "points 3"]) -> Float64[n
 
     The points lie in front of the camera; beyond the border the nearest pixel counts.
     """
-    homogeneous = transform_points(view.camera.camera_from_world, points) @ view.camera.intrinsics.T
-    pixel = homogeneous[:, :2] / homogeneous[:, 2:] - 0.5
+    pixel = projected(points, view.camera)[0] - 0.5
     limit = np.array([view.camera.width - 1, view.camera.height - 1])
     low = np.clip(np.floor(pixel), 0, np.maximum(limit - 1, 0)).astype(int)
     t = np.clip(pixel - low, 0, 1)

@@ -20,7 +20,9 @@ from torch import Tensor
 
 from ..maths.geometry import Pinhole, inside, pinhole_in_object, project, sample_image
 from ..maths.patch_alignment import align, beside_epipolar_lines_px, on_planes, patch_pixels
+from ..maths.projection import projected
 from ..scene import Camera, Decision, Progress, Region, SolvedCameras, SurfacePoints, View, transform_points
+from .bundle_adjustment import adjust_bundle
 from .lenses import rigid_matrix
 from .stereo import StereoResult, match_views
 from .stereo_config import StereoConfig
@@ -270,16 +272,10 @@ def largest_move_px(
 ) -> float:
     """Median over the points of how far they move in the picture, for the camera in which it is most."""
     moves = [
-        np.linalg.norm(_pixels(a, positions) - _pixels(b, positions), axis=1)
+        np.linalg.norm(projected(positions, a)[0] - projected(positions, b)[0], axis=1)
         for a, b in zip(cameras, others, strict=True)
     ]
     return max(float(np.median(move)) for move in moves)
-
-
-def _pixels(camera: Camera, positions: Float64[np.ndarray, "points 3"]) -> Float64[np.ndarray, "points 2"]:
-    homogeneous = transform_points(camera.camera_from_world, positions) @ camera.intrinsics.T
-    pixels: Float64[np.ndarray, "points 2"] = homogeneous[:, :2] / homogeneous[:, 2:]
-    return pixels
 
 
 def adjusted_cameras(cameras: Sequence[Camera], seen: Sightings) -> tuple[Camera, ...]:
@@ -304,18 +300,7 @@ def adjusted_cameras(cameras: Sequence[Camera], seen: Sightings) -> tuple[Camera
     tracks = _tracks(seen)
     shared = [patch for patch, track in enumerate(tracks) if track.length() >= 2]
     points = [model.add_point3D(seen.positions[patch], tracks[patch]) for patch in shared]
-    options = pycolmap.BundleAdjustmentOptions()
-    options.print_summary = False
-    options.refine_focal_length = options.refine_principal_point = options.refine_extra_params = False
-    options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
-    options.ceres.loss_function_scale = _ROBUST_SCALE_PX
-    # One thread: sums in another order would be another result.
-    options.ceres.solver_options.num_threads = 1
-    config = pycolmap.BundleAdjustmentConfig()
-    for image_id in model.reg_image_ids():
-        config.add_image(image_id)
-    config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
-    pycolmap.create_default_ceres_bundle_adjuster(options, config, model).solve()
+    adjust_bundle(model, free_lens=False, robust_scale_px=_ROBUST_SCALE_PX)
     moved = np.array([model.points3D[point].xyz for point in points]).reshape(-1, 3)
     world_from_adjusted = _similarity_or_none(moved, seen.positions[shared])
     if world_from_adjusted is None:

@@ -16,6 +16,7 @@ import pycolmap
 from jaxtyping import Float64
 
 from ..scene import Decision
+from .bundle_adjustment import adjust_bundle
 
 _ROBUST_SCALE_PX = 0.5
 """Of the Cauchy loss: wrong matches pull the principal point further than anything else."""
@@ -69,7 +70,7 @@ def refine_lenses(model: pycolmap.Reconstruction) -> tuple[Decision, ...]:
             if camera.has_bogus_params(*_SANE_FOCAL_RATIO, _SANE_RADIAL):
                 camera.params, estimate = before, None
         decisions.append(_decision(camera, before[0], estimate))
-    _adjust(model, free_lens=False)
+    adjust_bundle(model, free_lens=False, robust_scale_px=_ROBUST_SCALE_PX)
     model.update_point_3d_errors()
     return tuple(decisions)
 
@@ -87,7 +88,7 @@ def _prior(camera: pycolmap.Camera, focal_px: float) -> Gaussian:
 
 def _estimates(model: pycolmap.Reconstruction) -> dict[int, Gaussian]:
     """Adjusts the model with all lens parameters free; what it says of each lens, where it says anything."""
-    adjuster = _adjust(model, free_lens=True)
+    adjuster = adjust_bundle(model, free_lens=True, robust_scale_px=_ROBUST_SCALE_PX)
     model.update_point_3d_errors()
     error_px = _ERROR_INFLATION * model.compute_mean_reprojection_error()
     covariances = pycolmap.estimate_ba_covariance(pycolmap.BACovarianceOptions(), model, adjuster)
@@ -101,26 +102,6 @@ def _estimates(model: pycolmap.Reconstruction) -> dict[int, Gaussian]:
             mean = np.array(camera.params)
             estimates[camera_id] = Gaussian(mean=mean, covariance=np.asarray(covariance) * error_px**2)
     return estimates
-
-
-def _adjust(model: pycolmap.Reconstruction, *, free_lens: bool) -> pycolmap.CeresBundleAdjuster:
-    options = pycolmap.BundleAdjustmentOptions()
-    options.print_summary = False
-    options.refine_focal_length = free_lens
-    options.refine_principal_point = free_lens
-    options.refine_extra_params = free_lens
-    options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
-    options.ceres.loss_function_scale = _ROBUST_SCALE_PX
-    options.ceres.solver_options.function_tolerance = 1e-6
-    # One thread: sums in another order would be another result.
-    options.ceres.solver_options.num_threads = 1
-    config = pycolmap.BundleAdjustmentConfig()
-    for image_id in model.reg_image_ids():
-        config.add_image(image_id)
-    config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
-    adjuster = pycolmap.create_default_ceres_bundle_adjuster(options, config, model)
-    adjuster.solve()
-    return adjuster
 
 
 def _decision(camera: pycolmap.Camera, before_px: float, estimate: Gaussian | None) -> Decision:

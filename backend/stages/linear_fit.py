@@ -1,6 +1,5 @@
 """The linear part of the fit: the smoothest field that agrees with points, silhouettes and free space."""
 
-import math
 from dataclasses import dataclass
 
 import torch
@@ -65,20 +64,20 @@ def fit_level(
     measured_weight = measured.weight.clamp(max=4.0)
     ball = ball_behind(scene, radius, nodes)
     bound = least_distance(scene, nodes)
-    outside = torch.where(bound > 0, bound, -math.inf)
+    free = bound > 0
     through = _seen_through_any(scene, nodes, 3 * h)
     through_subject, pulled = silhouette_rays(scene, bound), torch.zeros((nodes**3, 2), device=before.device)
     rays, nearest = rim_rays(scene, nodes), cKDTree(points[0].cpu().numpy())
     distance = before
     for _ in range(rounds):
         target, weight = before.clone(), torch.full_like(before, config.prior * (32 / nodes) ** 2)
-        carved = distance < outside
-        target[carved], weight[carved] = outside[carved], config.free_space
+        carved = free & (distance < bound)
+        target[carved], weight[carved] = bound[carved], config.free_space
         carved = through & (distance < 2 * h)
         target[carved], weight[carved] = 2 * h, config.seen_through
         pulled = _FADE * pulled + _pulls(through_subject, distance)
         rays_near, depths = pulled.reshape(*distance.shape, 2).unbind(-1)
-        pull = config.silhouettes * rays_near.clamp(max=1.0) * (outside < 0)
+        pull = config.silhouettes * rays_near.clamp(max=1.0) * ~free
         inside = depths / rays_near.clamp(min=1e-6)
         rims = _rim_distances(scene, rays, distance, nearest, config.rims)
         rim_weight = rims.weight.clamp(max=2.0)

@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float64, Int64
 from scipy.ndimage import label
 
 from ..errors import ErrorCode, ReconstructionError
-from ..maths.raycast import in_picture
+from ..maths.projection import in_picture, projected
 from ..scene import Camera, Decision, Progress, Region, SolvedCameras, View, to_unit_sphere
 
 FEATURES_REACH = 1.1
@@ -202,14 +202,10 @@ def _masks_around(points: Float64[np.ndarray, "points 3"], views: list[View]) ->
     off, on = np.zeros(len(points), bool), np.zeros(len(points), np.int64)
     for view in views:
         assert view.mask is not None
-        in_camera = points @ view.camera.camera_from_world[:3, :3].T + view.camera.camera_from_world[:3, 3]
-        front = in_camera[:, 2] > 0
-        homogeneous = in_camera @ view.camera.intrinsics.T
-        pixel = np.floor(homogeneous[:, :2] / np.where(front, in_camera[:, 2], 1.0)[:, None]).astype(int)
-        shown = front & (pixel >= 0).all(axis=1)
-        shown &= (pixel[:, 0] < view.camera.width) & (pixel[:, 1] < view.camera.height)
+        shown = in_picture(points, view.camera)
+        column, row = projected(points[shown], view.camera)[0].astype(int).T
         inside = np.zeros(len(points), bool)
-        inside[shown] = view.mask[pixel[shown, 1], pixel[shown, 0]] > 0.5
+        inside[shown] = view.mask[row, column] > 0.5
         off |= shown & ~inside
         on += inside
     return np.where(off, 0, on)

@@ -60,13 +60,15 @@ def silhouette_rays(scene: Measurements, bound: Float[Tensor, "nodes nodes nodes
         rows, columns = torch.nonzero(outline[::step, ::step] < -0.5 * step, as_tuple=True)
         pixels = torch.stack([columns, rows], dim=-1) * step + 0.5
         directions = F.normalize(ray_directions(camera, pixels), dim=-1)
+        meets = _meets_region(scene, camera, directions)
+        rows, columns, directions = rows[meets], columns[meets], directions[meets]
         origins = camera.position.expand_as(directions)
         entry = sphere_entry(origins / _AROUND, directions) * _AROUND
         along = entry[:, None] + torch.linspace(0, 2 * _AROUND, 2 * nodes, device=entry.device)
         points = origins[:, None] + along[..., None] * directions[:, None]
         allowed = (read(bound, points.reshape(-1, 3)) < 0).reshape(along.shape).cumsum(dim=1)
         middle = torch.searchsorted(allowed, (allowed[:, -1:] + 1) // 2)
-        chosen = _meets_region(scene, camera, directions) & (allowed[:, -1] > 0)
+        chosen = allowed[:, -1] > 0
         at = along.gather(1, middle.clamp(max=along.shape[1] - 1))[:, 0]
         inside_px = -outline[rows * step, columns * step]
         depth = (inside_px * at / camera.intrinsics[0, 0]).clamp(max=spacing(nodes))

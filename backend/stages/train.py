@@ -7,7 +7,7 @@ the photographs (render_fit).
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 import torch
@@ -21,16 +21,11 @@ from .deadline import Clock, GridCost, deadline_after, finest_grid, predicted_s
 from .linear_fit import LinearConfig, fit_level, start
 from .measurements import Measurements, measurements
 from .render_fit import RenderConfig, refine
-from .silhouettes import least_distance, missing, silhouette_rays
 from .stereo import StereoResult
-from .unseen_side import DEEPEST, explained_radius, widest_angle_deg
+from .unseen_depth import depth_behind
 
 COARSEST = 48
 """Nodes along each axis of the grid that finds the surface's extent."""
-_TRIAL_ROUNDS = 6
-"""Of the fits that find how deep the subject is."""
-_MARGIN = 1.4
-"""How much deeper than the least that silhouettes ask for."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -90,7 +85,7 @@ def fit_surface(
     progress(0.0, "finding the extent of the surface")
     with torch.no_grad():
         scene = measurements(views, region, region, stereo, device)
-        radius = _radius_behind(scene, config.linear)
+        radius, depth = depth_behind(scene, config.linear)
         began_s = clock()
         distance = fit_level(scene, start(scene, radius, COARSEST), radius, config.rounds[0], config.linear)
         frame = _tight_frame(distance, region)
@@ -115,32 +110,11 @@ def fit_surface(
             distance, taken = refine(scene, distance, steps, config.render, generator, tell, deadline)
             rendered += taken
             done += steps
-    made = _decisions(scene, frame, config, radius=radius, nodes=len(distance), rendered=rendered)
+    made = _decisions(scene, frame, config, depth, nodes=len(distance), rendered=rendered)
     if config.budget_s is not None:
         used_s = config.budget_s - deadline.left_s()
         made = (*made, _of_budget(config.budget_s, used_s, config, costs, rendered))
     return Surface(distance=distance.cpu().numpy(), grid_from_world=frame.object_from_world, decisions=made)
-
-
-def _radius_behind(scene: Measurements, config: LinearConfig) -> float:
-    """Of the ball behind, in half widths of the subject: with which silhouettes are met of their own accord.
-
-    Rays through the subject that miss a surface fitted without them say that it goes on, farther back.
-    """
-    alone = replace(config, silhouettes=0.0)
-    rays = silhouette_rays(scene, least_distance(scene, COARSEST))
-
-    def num_missed(radius: float) -> int:
-        trial = fit_level(scene, start(scene, radius, COARSEST), radius, _TRIAL_ROUNDS, alone)
-        return int(missing(rays, trial).sum())
-
-    radius = explained_radius(scene)
-    tolerated = 1.1 * num_missed(DEEPEST) + 3
-    if num_missed(radius) <= tolerated:
-        return radius
-    while radius < DEEPEST and num_missed(radius) > tolerated:
-        radius = min(1.2 * radius, DEEPEST)
-    return min(_MARGIN * radius, DEEPEST)
 
 
 def _of_budget(
@@ -160,7 +134,13 @@ def _of_budget(
 
 
 def _decisions(
-    scene: Measurements, frame: Region, config: TrainConfig, *, radius: float, nodes: int, rendered: int
+    scene: Measurements,
+    frame: Region,
+    config: TrainConfig,
+    depth: Decision,
+    *,
+    nodes: int,
+    rendered: int,
 ) -> tuple[Decision, ...]:
     """What was modelled and what was left out, with the measurement behind it."""
     masks = sum(outline is not None for outline in scene.outlines)
@@ -179,11 +159,7 @@ def _decisions(
             choice="used" if masks or backdrops else "left out",
             because=f"{masks} photographs have masks, {backdrops} an even backdrop",
         ),
-        Decision(
-            what="depth of the unseen side",
-            choice=f"a ball of {radius:.2f} half widths of the subject behind what was measured",
-            because=_why_so_deep(scene, radius),
-        ),
+        depth,
         Decision(what="background", choice="left out", because="rays that miss the subject are not rendered"),
         Decision(
             what="refinement by rendering",
@@ -192,15 +168,6 @@ def _decisions(
         ),
     ]
     return tuple(made)
-
-
-def _why_so_deep(scene: Measurements, radius: float) -> str:
-    angle_deg = widest_angle_deg(scene)
-    taken = f"the photographs are taken from sides up to {angle_deg:.0f} degrees apart"
-    explained = explained_radius(scene)
-    if radius > explained:
-        return f"{taken}; with the {explained:.2f} that measured points ask for, silhouettes were missed"
-    return taken if angle_deg > 90 else f"{taken}; so turn the normals of the measured points"
 
 
 def _tight_frame(distance: Float[Tensor, "nodes nodes nodes"], region: Region) -> Region:

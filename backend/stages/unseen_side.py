@@ -22,7 +22,7 @@ def ball_behind(scene: Measurements, radius: float, nodes: int) -> Float[Tensor,
 
     Its radius is given in half widths of the subject.
     """
-    mean_p, mean_n = _middle(scene)
+    mean_p, mean_n = _mean(scene, scene.positions), _mean(scene, scene.normals)
     r = radius * _half_width(scene, mean_p)
     apart = node_positions(nodes, scene.positions.device) - (mean_p - r * mean_n)
     return (apart.square().sum(dim=-1) - r * r) / (2 * r)
@@ -35,19 +35,18 @@ def explained_radius(scene: Measurements) -> float:
     for points on one side what the turning of their normals says. Where the photographs are taken from
     sides far enough apart for silhouettes to bound the depth, it is as large as the subject is wide.
     """
-    mean_p, mean_n = _middle(scene)
-    weight = (scene.confidence / scene.confidence.sum())[:, None]
-    spread = (weight * (scene.normals - mean_n).square()).sum()
-    together = (weight * (scene.positions - mean_p) * (scene.normals - mean_n)).sum()
+    mean_p, mean_n = _mean(scene, scene.positions), _mean(scene, scene.normals)
+    turned = scene.normals - mean_n
+    spread = _mean(scene, turned.square()).sum()
+    together = _mean(scene, (scene.positions - mean_p) * turned).sum()
     turning = float(together / spread.clamp(min=1e-6)) / _half_width(scene, mean_p)
     explained = min(max(turning, LEAST_RADIUS), 1.0)
     return explained + depth_is_bounded(scene) * (1 - explained)
 
 
-def _middle(scene: Measurements) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"]]:
-    """Weighted mean of the points' positions and of their normals."""
-    weight = (scene.confidence / scene.confidence.sum())[:, None]
-    return (weight * scene.positions).sum(dim=0), (weight * scene.normals).sum(dim=0)
+def _mean(scene: Measurements, values: Float[Tensor, "points 3"]) -> Float[Tensor, "3"]:
+    """Over the points, weighted by their confidence."""
+    return (scene.confidence / scene.confidence.sum()) @ values
 
 
 def widest_angle_deg(scene: Measurements) -> float:

@@ -14,7 +14,6 @@ from backend.maths.raycast import (
     RayCaster,
     camera_rays,
     cast_rays,
-    in_picture,
     intersect_planes,
     render_mesh,
     visible_from,
@@ -221,19 +220,6 @@ def test_what_is_covered_or_out_of_the_picture_is_not_seen() -> None:
     np.testing.assert_array_equal(seen, [[False, True, False], [True, False, False], [False, False, False]])
     turned = visible_from(points, -normals, [front, between], caster)
     assert not turned.any()
-
-
-def test_in_picture_ends_at_the_pixels_outer_edges() -> None:
-    camera = camera_at(np.array([0.0, -4.0, 0.0]))
-    edges = np.array(
-        [[-0.01, 5], [0.01, 5], [63.99, 5], [64.01, 5], [5, -0.01], [5, 0.01], [5, 47.99], [5, 48.01]]
-    )
-    rays = np.concatenate([edges, np.ones((8, 1))], 1) @ np.linalg.inv(camera.intrinsics).T
-    world_from_camera = np.linalg.inv(camera.camera_from_world)
-    points = rays @ world_from_camera[:3, :3].T + world_from_camera[:3, 3]
-    expected = [False, True, True, False, False, True, True, False]
-    assert in_picture(points, camera).tolist() == expected
-    assert not in_picture(2 * camera.position - points, camera).any()
 
 
 def test_a_picture_of_800x600_takes_well_under_a_second() -> None:

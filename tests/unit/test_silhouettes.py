@@ -1,7 +1,6 @@
 """Capsules before cameras: where silhouettes let them be, which rays miss a field, and how deep they are."""
 
 import math
-from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -14,10 +13,11 @@ from torch import Tensor
 from backend.maths.geometry import Pinhole, pixel_centres, ray_directions
 from backend.maths.grid import node_positions, spacing
 from backend.maths.rays import first_crossing
+from backend.stages import unseen_depth
 from backend.stages.linear_fit import LinearConfig
 from backend.stages.measurements import Measurements
 from backend.stages.silhouettes import least_distance, missing, silhouette_rays
-from backend.stages.train import _radius_behind
+from backend.stages.unseen_depth import depth_behind
 from backend.stages.unseen_side import DEEPEST, ball_behind, explained_radius
 
 CPU = torch.device("cpu")
@@ -150,13 +150,22 @@ def test_no_ray_leaps_over_a_small_ball() -> None:
 def test_the_ball_behind_grows_with_what_only_silhouettes_show(measured_from: float) -> None:
     """Of a long body only the front is measured: its sides show in the outer photographs."""
     azimuths = [-20.0, 0.0, 20.0]
-    radii = []
-    for back in (0.2, -0.9):
-        scene = seen(azimuths, back, measured_from=measured_from)
-        radii.append(_radius_behind(scene, LinearConfig()))
-    short, long = radii
+    (short, why_short), (long, why_long) = (
+        depth_behind(seen(azimuths, back, measured_from=measured_from), LinearConfig())
+        for back in (0.2, -0.9)
+    )
     assert short == pytest.approx(explained_radius(seen(azimuths, 0.2, measured_from=measured_from)))
-    assert long > 1.5 * short
-    assert long <= DEEPEST
-    for one, other in pairwise(radii):
-        assert one < other
+    assert 1.5 * short < long <= DEEPEST
+    assert "silhouettes were missed" not in why_short.because
+    assert "silhouettes were missed" in why_long.because
+
+
+def test_without_silhouettes_nothing_is_tried(monkeypatch: pytest.MonkeyPatch) -> None:
+    scene = seen([-20.0, 0.0, 20.0], -0.9)
+    scene.outlines[:] = scene.certain[:] = [None] * 3
+
+    def tried(*_: object) -> None:
+        pytest.fail("a field was fitted")
+
+    monkeypatch.setattr(unseen_depth, "fit_level", tried)
+    assert depth_behind(scene, LinearConfig())[0] == explained_radius(scene)

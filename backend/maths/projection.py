@@ -1,0 +1,23 @@
+"""Where a camera shows points of the world: numpy, float64; maths/geometry.py does the same in torch."""
+
+import numpy as np
+from jaxtyping import Bool, Float, Float64
+
+from ..scene import Camera, transform_points
+
+
+def projected(
+    points: Float[np.ndarray, "points 3"], camera: Camera
+) -> tuple[Float64[np.ndarray, "points 2"], Float64[np.ndarray, "points"]]:
+    """Pixels and depths of points (world frame); pixels mean something where the depth is > 0."""
+    in_camera = transform_points(camera.camera_from_world, points)
+    depth = in_camera[:, 2]
+    homogeneous = in_camera @ camera.intrinsics.T
+    return homogeneous[:, :2] / np.where(depth > 0, depth, 1.0)[:, None], depth
+
+
+def in_picture(points: Float[np.ndarray, "points 3"], camera: Camera) -> Bool[np.ndarray, "points"]:
+    """True where a point lies in front of the camera and within its picture's edges."""
+    pixels, depth = projected(points, camera)
+    within = (pixels >= 0) & (pixels < [camera.width, camera.height])
+    return np.asarray(within.all(axis=1) & (depth > 0))

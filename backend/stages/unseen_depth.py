@@ -1,0 +1,52 @@
+"""How deep the subject is where no photograph shows it: found by trying."""
+
+from dataclasses import replace
+
+from ..scene import Decision
+from .linear_fit import LinearConfig, fit_level, start
+from .measurements import Measurements
+from .silhouettes import least_distance, missing, silhouette_rays
+from .unseen_side import DEEPEST, depth_is_bounded, explained_radius, widest_angle_deg
+
+_NODES = 32
+_ROUNDS = 6
+"""Of each trial."""
+_GROWTH = 1.2
+"""From one trial to the next."""
+_MARGIN = 1.4
+"""How much deeper than the least that silhouettes ask for."""
+
+
+def depth_behind(scene: Measurements, config: LinearConfig) -> tuple[float, Decision]:
+    """Radius of the ball behind, in half widths of the subject, and what decided it."""
+    explained = explained_radius(scene)
+    radius = _met_radius(scene, explained, config)
+    angle_deg = widest_angle_deg(scene)
+    because = f"the photographs are taken from sides up to {angle_deg:.0f} degrees apart"
+    if radius > explained:
+        because += f"; with the {explained:.2f} that measured points ask for, silhouettes were missed"
+    elif angle_deg <= 90:
+        because += "; so turn the normals of the measured points"
+    choice = f"a ball of {radius:.2f} half widths of the subject behind what was measured"
+    return radius, Decision(what="depth of the unseen side", choice=choice, because=because)
+
+
+def _met_radius(scene: Measurements, explained: float, config: LinearConfig) -> float:
+    """The radius from `explained` on with which silhouettes are met of their own accord.
+
+    Rays through the subject that miss a surface fitted without them say that it goes on, farther back. Where
+    silhouettes bound the depth there is nothing to find out.
+    """
+    rays = silhouette_rays(scene, least_distance(scene, _NODES))
+    if depth_is_bounded(scene) == 1 or not len(rays.origins):
+        return explained
+    alone = replace(config, silhouettes=0.0)
+
+    def num_missed(radius: float) -> int:
+        trial = fit_level(scene, start(scene, radius, _NODES), radius, _ROUNDS, alone)
+        return int(missing(rays, trial).sum())
+
+    radius, tolerated = explained, 1.1 * num_missed(DEEPEST) + 3
+    while radius < DEEPEST and num_missed(radius) > tolerated:
+        radius = min(_GROWTH * radius, DEEPEST)
+    return radius if radius == explained else min(_MARGIN * radius, DEEPEST)
