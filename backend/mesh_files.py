@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Float64, UInt8, UInt16
 
+from .maths.srgb import linear_from_srgb
 from .scene import Region, SurfaceMesh, SurfacePoints, transform_points
 
 _POINT_FIELDS = [(axis, "<f8") for axis in ("x", "y", "z")] + [(axis, "<f4") for axis in ("nx", "ny", "nz")]
@@ -147,9 +148,8 @@ def _counts(header: bytes) -> tuple[int, int]:
 
 
 def _linear_rgba(colours_srgb: UInt8[np.ndarray, "vertices 3"]) -> UInt16[np.ndarray, "vertices 4"]:
-    """Linear light, 65535 = 1, opaque: glTF's COLOR_0 is linear (IEC 61966-2-1 decoding)."""
-    steps = np.arange(256) / 255.0
-    linear = np.where(steps <= 0.04045, steps / 12.92, ((steps + 0.055) / 1.055) ** 2.4)
+    """Linear light, 65535 = 1, opaque: glTF's COLOR_0 is linear."""
+    linear = linear_from_srgb(np.arange(256) / 255.0)
     rgba = np.full((len(colours_srgb), 4), 65535, np.uint16)
     rgba[:, :3] = np.round(linear * 65535).astype(np.uint16)[colours_srgb]
     return rgba

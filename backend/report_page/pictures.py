@@ -15,6 +15,7 @@ from PIL import Image
 
 from ..images import resized
 from ..maths.raycast import MeshImage
+from ..maths.srgb import srgb_from_linear
 from ..scene import Camera
 
 JPEG_QUALITY = 86
@@ -62,18 +63,6 @@ def picture(image_srgb: Float[np.ndarray, "height width 3"], size: tuple[int, in
     file = io.BytesIO()
     Image.fromarray(pixels).save(file, "JPEG", quality=JPEG_QUALITY, optimize=True)
     return Picture(jpeg=file.getvalue(), width=width, height=height, alt=alt)
-
-
-def linear_from_srgb(srgb: Float[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape"]:
-    """IEC 61966-2-1."""
-    return np.where(srgb <= 0.04045, srgb / 12.92, ((np.maximum(srgb, 0.04045) + 0.055) / 1.055) ** 2.4)
-
-
-def srgb_from_linear(linear: Float[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape"]:
-    """IEC 61966-2-1, the inverse of linear_from_srgb."""
-    return np.where(
-        linear <= 0.0031308, linear * 12.92, 1.055 * np.maximum(linear, 1e-3) ** (1 / 2.4) - 0.055
-    )
 
 
 def before_backdrop(

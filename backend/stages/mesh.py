@@ -10,7 +10,7 @@ import fast_simplification
 import numpy as np
 import torch
 import trimesh
-from jaxtyping import Bool, Float32, Float64, Int64, UInt8
+from jaxtyping import Bool, Float32, Float64, Int64
 from scipy.spatial import cKDTree
 from skimage.measure import marching_cubes
 
@@ -18,10 +18,10 @@ from ..errors import ErrorCode, ReconstructionError
 from ..maths.grid import near_surface, refined, spacing
 from ..maths.pieces import connected_pieces
 from ..maths.raycast import RayCaster, visible_from
-from ..maths.sampling import colours_at
 from ..scene import Decision, Progress, Region, SurfaceMesh, View, transform_points
 from .stereo import DepthMap, StereoResult
 from .train import Surface
+from .vertex_colours import colour_vertices
 
 Vertices = Float64[np.ndarray, "vertices 3"]
 Faces = Int64[np.ndarray, "faces 3"]
@@ -83,7 +83,8 @@ def extract_mesh(
     vertices, faces = only_used(vertices, faces[kept])
     normals, seen, support = normals[used], seen[used], support[used]
     progress(0.7, "colour")
-    colours = vertex_colours(vertices, normals, seen, views)
+    colours, exposure = colour_vertices(vertices, normals, seen, views)
+    decisions = (*decisions, exposure)
     return SurfaceMesh(
         vertices=vertices,
         faces=faces,
@@ -267,30 +268,3 @@ def measured_at_edges(map_: DepthMap) -> float:
     inset = max(4, round(0.02 * min(sure.shape)))
     frame = [sure[inset], sure[-inset - 1], sure[:, inset], sure[:, -inset - 1]]
     return float(np.concatenate(frame).mean())
-
-
-def vertex_colours(
-    vertices: Vertices,
-    normals: Float64[np.ndarray, "vertices 3"],
-    seen: Bool[np.ndarray, "vertices views"],
-    views: tuple[View, ...],
-) -> UInt8[np.ndarray, "vertices 3"]:
-    """Mean of the photographs that see a vertex, those that see it frontally first; others from around."""
-    total, weight = np.zeros((len(vertices), 3)), np.zeros(len(vertices))
-    for column, view in enumerate(views):
-        mine = np.flatnonzero(seen[:, column])
-        towards = view.camera.position - vertices[mine]
-        facing = (towards * normals[mine]).sum(axis=1) / np.linalg.norm(towards, axis=1)
-        sampled = colours_at(view, vertices[mine])
-        # a pixel half off the subject has half the backdrop's colour: the fourth power leaves it out
-        share = (np.clip(facing, 1e-3, 1) * sampled[:, 3]) ** 4
-        total[mine] += share[:, None] * sampled[:, :3]
-        weight[mine] += share
-    known = weight > 0
-    colours = total / np.where(known, weight, 1.0)[:, None]
-    if known.any() and not known.all():
-        distance, nearest = cKDTree(vertices[known]).query(vertices[~known], k=min(16, int(known.sum())))
-        near = 1 / (np.atleast_2d(distance.T).T + 1e-3 * np.ptp(vertices))
-        mixed = (near[..., None] * colours[known][np.atleast_2d(nearest.T).T]).sum(axis=1)
-        colours[~known] = mixed / near.sum(axis=1, keepdims=True)
-    return np.clip(colours * 255 + 0.5, 0, 255).astype(np.uint8)

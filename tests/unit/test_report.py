@@ -512,14 +512,6 @@ def shift_by(offset: list[float]) -> np.ndarray:
     return shift
 
 
-def test_srgb_and_linear_are_inverse_and_meet_the_standard() -> None:
-    values = np.linspace(0, 1, 1001)
-    np.testing.assert_allclose(
-        pictures.srgb_from_linear(pictures.linear_from_srgb(values)), values, atol=1e-6
-    )
-    assert pictures.linear_from_srgb(np.array(0.5)) == pytest.approx(0.21404, abs=1e-5)
-
-
 def lone_pixel(normal: tuple[float, float, float], support: float = 0.0) -> MeshImage:
     """What a camera at (0, -4, 0) sees in its single pixel; it looks along +y."""
     return MeshImage(
