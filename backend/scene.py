@@ -136,9 +136,10 @@ class CameraEvidence:
     error_px: Float64[np.ndarray, "points views"]
     """How far beside its sparse point a feature lies, in pixels of the photograph; 0 where it is not seen."""
     pose_covariance: Float64[np.ndarray, "views 6 6"] | None
-    """Of each camera's orientation (rotation vector, world axes, radians) and centre (world units), with
-    the cameras as a whole as the frame (maths/gauge.py) and the lenses held; None where nothing is left over
-    to tell errors from."""
+    """Of each camera's orientation (rotation vector, world axes, radians) and centre (world units), in the
+    frame of the cameras as a whole (maths/gauge.py). None where nothing is left over to tell errors from."""
+    lenses_free: bool
+    """Whether that counts what the photographs leave open of the lenses; of two photographs they are held."""
     point_sigma_world: Float64[np.ndarray, "points"] | None
     """Standard deviation of each sparse point where it is least sure, the cameras held."""
 

@@ -5,8 +5,8 @@ from jaxtyping import Float64
 
 
 def angles_between(
-    a: Float64[np.ndarray, "*batch 3"], b: Float64[np.ndarray, "*batch 3"]
-) -> Float64[np.ndarray, "*batch"]:
+    a: Float64[np.ndarray, "*#batch 3"], b: Float64[np.ndarray, "*#batch 3"]
+) -> Float64[np.ndarray, "*#batch"]:
     """Angles between unit vectors, radians: 2 atan2(|a - b|, |a + b|).
 
     Kahan, "How futile are mindless assessments of roundoff in floating-point computation?" (2006), 12. The

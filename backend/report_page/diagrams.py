@@ -107,7 +107,7 @@ def _photograph(
 def histogram(bars: Sequence[Bar], title: str) -> Markup:
     """Counts as columns with their numbers above and their labels below."""
     most = max((bar.count for bar in bars), default=0)
-    foot, top = _BARS_HEIGHT - 46, 24
+    foot, top = _BARS_HEIGHT - 46.0, 24.0
     step = _BARS_WIDTH / max(len(bars), 1)
     parts = [_opening(_BARS_WIDTH, _BARS_HEIGHT, title)]
     for index, bar in enumerate(bars):

@@ -15,6 +15,9 @@ from ..maths.gauge import cross_matrix, in_gauge_of_the_whole
 from ..scene import CameraEvidence
 from .lenses import shared_tracks
 
+FEWEST_FOR_LENSES = 3
+"""Photographs that tell anything of their lens; two leave it as it is (lens_refinement.py)."""
+
 
 def camera_evidence(
     model: pycolmap.Reconstruction,
@@ -30,7 +33,8 @@ def camera_evidence(
     """
     num_features, num_matched, num_verified = _matches(database, tuple(names))
     offsets_px = _offsets_px(model, placed)
-    poses, points = _covariances_or_none(model, placed, offsets_px)
+    lenses_free = len(placed) >= FEWEST_FOR_LENSES
+    poses, points = _covariances_or_none(model, placed, offsets_px, lenses_free=lenses_free)
     scale = np.asarray(photo_px_per_picture_px, np.float64)
     return CameraEvidence(
         names=tuple(names.values()),
@@ -39,6 +43,7 @@ def camera_evidence(
         num_verified=num_verified,
         error_px=np.linalg.norm(offsets_px, axis=2) * scale,
         pose_covariance=poses,
+        lenses_free=lenses_free,
         point_sigma_world=points,
     )
 
@@ -84,7 +89,11 @@ def _offsets_px(
 
 
 def _covariances_or_none(
-    model: pycolmap.Reconstruction, placed: Sequence[int], offsets_px: Float64[np.ndarray, "points views 2"]
+    model: pycolmap.Reconstruction,
+    placed: Sequence[int],
+    offsets_px: Float64[np.ndarray, "points views 2"],
+    *,
+    lenses_free: bool,
 ) -> tuple[Float64[np.ndarray, "views 6 6"] | None, Float64[np.ndarray, "points"] | None]:
     """Of poses, and of points given the poses, with the noise that the pixels themselves show.
 
@@ -92,7 +101,9 @@ def _covariances_or_none(
     """
     tracks = shared_tracks(model, placed)
     num_equations = 2 * sum(len(track) for track in tracks.values())
-    num_left = num_equations - 3 * len(tracks) - 6 * len(placed) + 7
+    lenses = {model.images[image_id].camera_id for image_id in placed}
+    num_lens = sum(len(model.cameras[lens].params) for lens in lenses) if lenses_free else 0
+    num_left = num_equations - 3 * len(tracks) - 6 * len(placed) - num_lens + 7
     if num_left <= 0:
         return None, None
     config = pycolmap.BundleAdjustmentConfig()
@@ -101,7 +112,8 @@ def _covariances_or_none(
     config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
     options = pycolmap.BundleAdjustmentOptions()
     options.print_summary = False
-    options.refine_focal_length = options.refine_principal_point = options.refine_extra_params = False
+    options.refine_focal_length = lenses_free
+    options.refine_principal_point = options.refine_extra_params = lenses_free
     adjuster = pycolmap.create_default_ceres_bundle_adjuster(options, config, model)
     found = pycolmap.estimate_ba_covariance(pycolmap.BACovarianceOptions(), model, adjuster)
     if found is None:

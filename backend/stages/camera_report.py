@@ -274,7 +274,8 @@ def camera_report_numbers(report: CameraReport) -> dict[str, object]:
         "track_lengths": {str(n): count for n, count in enumerate(report.track_lengths, 2)},
         "angle_steps_deg": list(ANGLE_STEPS_DEG),
         "angle_counts": list(report.angle_counts),
-        "pose_covariance_gauge": "the cameras as a whole; lenses held",
+        "pose_covariance_gauge": "the cameras as a whole",
+        "pose_covariance_lenses": None if evidence is None else "free" if evidence.lenses_free else "held",
         "pose_covariance_rad_world": None
         if covariances is None
         else {v.name: c.tolist() for v, c in zip(report.solved.views, covariances, strict=True)},
