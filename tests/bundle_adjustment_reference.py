@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import torch
 from jaxtyping import Float64, Int64
 from torch import Tensor
-from torch.func import jacfwd, vmap
+from torch.func import jacrev, vmap
 
 NUM_GAUGE = 7
 """Directions in which cameras and points can move together unseen: shift, turn, scale."""
@@ -32,13 +32,15 @@ class Observations:
 
 @dataclass(frozen=True, kw_only=True)
 class Adjusted:
-    """Cameras and points with the smallest sum of squares."""
+    """Cameras, points and lens with the smallest sum of squares."""
 
     camera_from_world: Float64[Tensor, "cameras 4 4"]
     points: Float64[Tensor, "points 3"]
+    lens: Float64[Tensor, "4"]
     residuals: Float64[Tensor, "observations 2"]
     covariance: Float64[Tensor, "parameters parameters"]
-    """For errors of one pixel: of each camera's twist, then of each point; the smallest one of all gauges."""
+    """For errors of one pixel, of each camera's twist, then of each point, then of the lens; 0 for what was
+    held. Of all gauges the one with the smallest trace."""
 
 
 def cross_matrix(vectors: Float64[Tensor, "*batch 3"]) -> Float64[Tensor, "*batch 3 3"]:
@@ -81,62 +83,78 @@ def adjusted(
     points: Float64[Tensor, "points 3"],
     *,
     cameras_free: bool = True,
-    rounds: int = 50,
+    lens_free: bool = False,
+    rounds: int = 12,
 ) -> Adjusted:
     """From a start nearby to the least squares, by Levenberg and Marquardt on the dense normal equations."""
-    residuals, jacobian = _linearised(seen, camera_from_world, points)
-    num_twists = 6 * len(camera_from_world)
+    num_twists, num_motions = 6 * len(camera_from_world), 6 * len(camera_from_world) + 3 * len(points)
+    columns = torch.arange(0 if cameras_free else num_twists, num_motions + (4 if lens_free else 0))
+    state = camera_from_world, points, seen.lens
+    residuals, jacobian = _linearised(seen, *state)
     damping = 1e-4
     for _ in range(rounds):
-        if not cameras_free:
-            jacobian = torch.cat(
-                [torch.zeros_like(jacobian[:, :num_twists]), jacobian[:, num_twists:]], dim=1
-            )
-        normal = jacobian.T @ jacobian
-        diagonal = torch.diag(normal.diagonal().clamp(min=1e-12))
-        step = -torch.linalg.solve(normal + damping * diagonal, jacobian.T @ residuals.flatten())
-        motions = torch.linalg.matrix_exp(twist_matrix(step[:num_twists].unflatten(0, (-1, 6))))
-        moved = motions @ camera_from_world, points + step[num_twists:].unflatten(0, (-1, 3))
+        free = jacobian[:, columns]
+        normal = free.T @ free
+        damped = normal + damping * torch.diag(normal.diagonal())
+        step = torch.zeros(num_motions + 4, dtype=torch.float64)
+        step[columns] = -torch.linalg.solve(damped, free.T @ residuals.flatten())
+        moved = _moved(state, step)
         there = _linearised(seen, *moved)
         if there[0].square().sum() <= residuals.square().sum():
-            (camera_from_world, points), (residuals, jacobian) = moved, there
-            damping = max(damping / 10, 1e-14)
+            state, (residuals, jacobian) = moved, there
+            damping = max(damping / 10, 1e-12)
         else:
             damping *= 10
+    free = jacobian[:, columns]
+    covariance = torch.zeros(num_motions + 4, num_motions + 4, dtype=torch.float64)
+    num_unknowable = NUM_GAUGE if cameras_free else 0
+    covariance[columns[:, None], columns] = _pseudo_inverse(free.T @ free, num_unknowable)
     return Adjusted(
-        camera_from_world=camera_from_world,
-        points=points,
+        camera_from_world=state[0],
+        points=state[1],
+        lens=state[2],
         residuals=residuals,
-        covariance=_pseudo_inverse(jacobian.T @ jacobian),
+        covariance=covariance,
     )
 
 
+def _moved(state: tuple[Tensor, Tensor, Tensor], step: Float64[Tensor, "parameters"]) -> tuple[Tensor, ...]:
+    camera_from_world, points, lens = state
+    twists, shifts, change = step.split([6 * len(camera_from_world), 3 * len(points), 4])
+    motions = torch.linalg.matrix_exp(twist_matrix(twists.unflatten(0, (-1, 6))))
+    return motions @ camera_from_world, points + shifts.unflatten(0, (-1, 3)), lens + change
+
+
 def _linearised(
-    seen: Observations, camera_from_world: Float64[Tensor, "cameras 4 4"], points: Float64[Tensor, "points 3"]
+    seen: Observations,
+    camera_from_world: Float64[Tensor, "cameras 4 4"],
+    points: Float64[Tensor, "points 3"],
+    lens: Float64[Tensor, "4"],
 ) -> tuple[Float64[Tensor, "observations 2"], Float64[Tensor, "rows parameters"]]:
-    """Residuals in pixels and their dense Jacobian by twists and points, derived by torch."""
+    """Residuals in pixels and their dense Jacobian by twists, points and lens, derived by torch."""
 
     def pixel(
-        motion: Float64[Tensor, "9"], pose: Float64[Tensor, "4 4"], point: Float64[Tensor, "3"]
+        motion: Float64[Tensor, "13"], pose: Float64[Tensor, "4 4"], point: Float64[Tensor, "3"]
     ) -> Float64[Tensor, "2"]:
         moved = pose + twist_matrix(motion[:6]) @ pose  # the exponential to first order: exact at 0
-        return projected(seen.lens, moved, point + motion[6:])
+        return projected(lens + motion[9:], moved, point + motion[6:9])
 
     poses, positions = camera_from_world[seen.camera], points[seen.point]
-    still = torch.zeros(9, dtype=torch.float64)
-    slopes = vmap(lambda pose, point: jacfwd(pixel)(still, pose, point))(poses, positions)
-    count = len(seen.pixels)
-    jacobian = torch.zeros(count, 2, 6 * len(camera_from_world) + 3 * len(points), dtype=torch.float64)
+    still = torch.zeros(13, dtype=torch.float64)
+    slopes = vmap(lambda pose, point: jacrev(pixel)(still, pose, point))(poses, positions)
+    count, num_twists = len(seen.pixels), 6 * len(camera_from_world)
+    jacobian = torch.zeros(count, 2, num_twists + 3 * len(points) + 4, dtype=torch.float64)
     every = torch.arange(count)
     for axis in range(6):
         jacobian[every, :, 6 * seen.camera + axis] = slopes[..., axis]
     for axis in range(3):
-        jacobian[every, :, 6 * len(camera_from_world) + 3 * seen.point + axis] = slopes[..., 6 + axis]
-    return projected(seen.lens, poses, positions) - seen.pixels, jacobian.flatten(0, 1)
+        jacobian[every, :, num_twists + 3 * seen.point + axis] = slopes[..., 6 + axis]
+    jacobian[..., -4:] = slopes[..., 9:]
+    return projected(lens, poses, positions) - seen.pixels, jacobian.flatten(0, 1)
 
 
-def _pseudo_inverse(normal: Float64[Tensor, "n n"]) -> Float64[Tensor, "n n"]:
-    """The inverse where the normal equations have one: without their seven smallest eigenvalues."""
+def _pseudo_inverse(normal: Float64[Tensor, "n n"], num_unknowable: int) -> Float64[Tensor, "n n"]:
+    """The inverse where the normal equations have one: without so many smallest eigenvalues."""
     values, vectors = torch.linalg.eigh(normal)
-    kept = vectors[:, NUM_GAUGE:]
-    return (kept / values[NUM_GAUGE:]) @ kept.T
+    kept = vectors[:, num_unknowable:]
+    return (kept / values[num_unknowable:]) @ kept.T

@@ -32,16 +32,16 @@ def camera_evidence(
     ids in the order of the views, and the last is how much larger the photograph of each is than its picture.
     """
     num_features, num_matched, num_verified = _matches(database, tuple(names))
-    offsets_px = _offsets_px(model, placed)
+    offsets = offsets_px(model, placed)
     lenses_free = len(placed) >= FEWEST_FOR_LENSES
-    poses, points = _covariances_or_none(model, placed, offsets_px, lenses_free=lenses_free)
+    poses, points = covariances_or_none(model, placed, offsets, lenses_free=lenses_free)
     scale = np.asarray(photo_px_per_picture_px, np.float64)
     return CameraEvidence(
         names=tuple(names.values()),
         num_features=num_features,
         num_matched=num_matched,
         num_verified=num_verified,
-        error_px=np.linalg.norm(offsets_px, axis=2) * scale,
+        error_px=np.linalg.norm(offsets, axis=2) * scale,
         pose_covariance=poses,
         lenses_free=lenses_free,
         point_sigma_world=points,
@@ -69,7 +69,7 @@ def _matches(
     return np.array(features, np.int64), matched, verified
 
 
-def _offsets_px(
+def offsets_px(
     model: pycolmap.Reconstruction, placed: Sequence[int]
 ) -> Float64[np.ndarray, "points views 2"]:
     """From where the lens shows each point to its feature; 0 where it has none."""
@@ -88,7 +88,7 @@ def _offsets_px(
     return offsets
 
 
-def _covariances_or_none(
+def covariances_or_none(
     model: pycolmap.Reconstruction,
     placed: Sequence[int],
     offsets_px: Float64[np.ndarray, "points views 2"],

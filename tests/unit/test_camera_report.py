@@ -124,6 +124,8 @@ def all_strong() -> CameraEvidence:
     return replace(
         evidence,
         names=tuple(view.name for view in solved().views),
+        num_features=np.array([500, 600, 700]),
+        num_matched=np.full((3, 3), 300) * (1 - np.eye(3, dtype=np.int64)),
         error_px=evidence.error_px / 2,
         num_verified=np.full((3, 3), 200) * (1 - np.eye(3, dtype=np.int64)),
     )
