@@ -35,6 +35,9 @@ def camera_evidence(
     offsets = offsets_px(model, placed)
     lenses_free = len(placed) >= FEWEST_FOR_LENSES
     poses, points = covariances_or_none(model, placed, offsets, lenses_free=lenses_free)
+    if poses is None and lenses_free:  # as of a wall: then the lenses were not refined either
+        lenses_free = False
+        poses, points = covariances_or_none(model, placed, offsets, lenses_free=False)
     scale = np.asarray(photo_px_per_picture_px, np.float64)
     return CameraEvidence(
         names=tuple(names.values()),
