@@ -1,4 +1,4 @@
-"""The command line: python -m backend reconstruct | doctor | install | rehearse | benchmark."""
+"""The command line: python -m backend reconstruct | cameras | doctor | install | rehearse | benchmark."""
 
 import argparse
 import faulthandler
@@ -19,6 +19,7 @@ from .wire.environment import BUILDS
 from .wire.protocol import DEVICES, PRESETS, PROTOCOL_VERSION, Job
 
 _JOB_OPTIONS = ("output", "cameras", "masks", "preset", "device", "seed", "truth")
+_CAMERA_OPTIONS = ("output", "cameras", "masks", "preset", "seed")
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -41,6 +42,8 @@ def run(arguments: list[str] | None) -> int:
         return _install(parsed)
     if parsed.command == "benchmark":
         return benchmark(parsed)
+    if parsed.command == "cameras":
+        return _cameras(parsed)
     if parsed.command == "rehearse":
         return rehearse(parsed.output, seconds=parsed.seconds, end=parsed.end)
     return _reconstruct(parser, parsed)
@@ -65,6 +68,11 @@ def _reconstruct(parser: argparse.ArgumentParser, parsed: argparse.Namespace) ->
     return on_terminal(
         Job(protocol=PROTOCOL_VERSION, images=tuple(parsed.images), **given, **region, **budget)
     )
+
+
+def _cameras(parsed: argparse.Namespace) -> int:
+    given = {name: value for name in _CAMERA_OPTIONS if (value := getattr(parsed, name)) is not None}
+    return on_terminal(Job(protocol=PROTOCOL_VERSION, images=tuple(parsed.images), until="cameras", **given))
 
 
 def _doctor(*, as_json: bool, on_wire: bool) -> int:
@@ -118,6 +126,9 @@ def _parser() -> argparse.ArgumentParser:
         metavar="S",
         help="time for fitting the surface, the rest of the run not counted (what the preset needs)",
     )
+    _add_cameras(
+        commands.add_parser("cameras", help="find where photographs were taken, and how sure that is")
+    )
     check = commands.add_parser("doctor", help="check that everything needed is there")
     form = check.add_mutually_exclusive_group()
     form.add_argument("--json", action="store_true", help="for programs")
@@ -129,6 +140,16 @@ def _parser() -> argparse.ArgumentParser:
     rehearsal.add_argument("--end", choices=("finished", "failed", "crashed"), default="finished")
     add_benchmark(commands.add_parser("benchmark", help="measure speed against error"))
     return parser
+
+
+def _add_cameras(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument
+    add("images", nargs="+", metavar="IMAGES", help="image files or folders")
+    add("--output", metavar="DIR", required=True, help="folder of the results, as for reconstruct")
+    add("--cameras", metavar="FILE_OR_FOLDER", help="cameras to be looked at; else they are estimated")
+    add("--masks", metavar="FOLDER", help="an image per photograph, white on the subject")
+    add("--preset", choices=PRESETS, help="of a reconstruction that is to go on from here (balanced)")
+    add("--seed", type=_seed, metavar="N", help="of all chance (0)")
 
 
 def _add_install(parser: argparse.ArgumentParser) -> None:

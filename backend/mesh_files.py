@@ -25,6 +25,8 @@ _PLY_NAMES = {"<f8": "double", "<f4": "float", "|u1": "uchar"}
 
 _Y_UP_FROM_Z_UP = np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]], np.float64)
 """glTF has y up; the world of given cameras has z up by convention, so that Blender turns it back."""
+_FAR_IN_SIZES = 16
+"""From the origin; up to here single precision is good to a millionth of the size."""
 _GLTF_FLOAT, _GLTF_USHORT, _GLTF_UINT = 5126, 5123, 5125
 _GLTF_VERTICES, _GLTF_INDICES = 34962, 34963
 
@@ -89,17 +91,22 @@ def write_sparse(
 
 
 def write_glb(path: Path, mesh: SurfaceMesh) -> None:
-    """Write a binary glTF 2.0: y up, linear vertex colours, the custom attribute `_SUPPORT`."""
-    positions = (mesh.vertices @ _Y_UP_FROM_Z_UP.T).astype("<f4")
+    """Write a binary glTF 2.0: y up, linear vertex colours, the custom attribute `_SUPPORT`.
+
+    Positions are in single precision, so those of a mesh far from the origin are relative to its middle,
+    which the node's translation holds in double precision.
+    """
+    positions = mesh.vertices @ _Y_UP_FROM_Z_UP.T
+    middle = _middle_if_far(positions)
     attributes = {
-        "POSITION": positions,
+        "POSITION": (positions - middle).astype("<f4"),
         "NORMAL": (mesh.normals @ _Y_UP_FROM_Z_UP.T).astype("<f4"),
         "COLOR_0": _linear_rgba(mesh.colours_srgb).astype("<u2"),
         "_SUPPORT": mesh.support.astype("<f4"),
     }
     corners = mesh.faces.astype("<u4").ravel()
     binary = b"".join(array.tobytes() for array in (*attributes.values(), corners))
-    structure = json.dumps(_gltf(attributes, corners), separators=(",", ":")).encode()
+    structure = json.dumps(_gltf(attributes, corners, middle), separators=(",", ":")).encode()
     structure += b" " * (-len(structure) % 4)
     size = 12 + 8 + len(structure) + 8 + len(binary)
     path.write_bytes(
@@ -155,7 +162,19 @@ def _linear_rgba(colours_srgb: UInt8[np.ndarray, "vertices 3"]) -> UInt16[np.nda
     return rgba
 
 
-def _gltf(attributes: dict[str, np.ndarray], corners: np.ndarray) -> dict[str, object]:
+def _middle_if_far(positions: Float64[np.ndarray, "vertices 3"]) -> Float64[np.ndarray, "3"]:
+    """The middle of the box of positions that lie far from the origin for their size; else the origin."""
+    if not len(positions):
+        return np.zeros(3)
+    low, high = positions.min(axis=0), positions.max(axis=0)
+    middle = (low + high) / 2
+    far = np.abs(middle).max() > _FAR_IN_SIZES * (high - low).max()
+    return np.asarray(middle if far else np.zeros(3))
+
+
+def _gltf(
+    attributes: dict[str, np.ndarray], corners: np.ndarray, translation: Float64[np.ndarray, "3"]
+) -> dict[str, object]:
     """The JSON part of the file; the arrays follow each other in the binary part."""
     types = {"<f4": _GLTF_FLOAT, "<u2": _GLTF_USHORT, "<u4": _GLTF_UINT}
     accessors: list[dict[str, object]] = []
@@ -184,11 +203,14 @@ def _gltf(attributes: dict[str, np.ndarray], corners: np.ndarray) -> dict[str, o
         "material": 0,
     }
     surface = {"metallicFactor": 0.0, "roughnessFactor": 1.0}
+    node: dict[str, object] = {"mesh": 0, "name": "FewView"}
+    if translation.any():
+        node["translation"] = translation.tolist()
     return {
         "asset": {"version": "2.0", "generator": "FewView"},
         "scene": 0,
         "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0, "name": "FewView"}],
+        "nodes": [node],
         "meshes": [{"name": "FewView", "primitives": [primitive]}],
         "materials": [{"pbrMetallicRoughness": surface, "doubleSided": True}],
         "accessors": accessors,

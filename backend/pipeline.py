@@ -25,6 +25,7 @@ from .previews import Previews
 from .results import cameras_summary, summary, write_all, write_cameras
 from .scene import Decision, Photo, Region, SolvedCameras, SurfaceMesh
 from .stages.camera_refinement import match_solved, with_refined
+from .stages.camera_report import build_camera_report
 from .stages.cameras import solve_cameras
 from .stages.mesh import extract_mesh
 from .stages.photos import load_photos
@@ -194,8 +195,9 @@ def run(job: Job, workspace: Workspace, *, settings: Settings, stages: Stages, l
     this = _Run(workspace=workspace, listener=listener, fingerprints=fingerprints, stage_names=names)
     solved, region = _placed(job, this, settings, stages)
     if job.until == "cameras":
-        files = write_cameras(solved, region, workspace)
-        return Outcome(files=files, summary=cameras_summary(solved))
+        name = job.output.resolve().name
+        told = build_camera_report(solved, region, job_name=name, seed=job.seed, versions=_versions())
+        return Outcome(files=write_cameras(told, workspace), summary=cameras_summary(told))
     inputs = _reconstructed(job, this, settings, stages, placed=(solved, region, device))
     report = this.unkept_stage("report", partial(stages.build_report, inputs, settings.report))
     return Outcome(files=write_all(report, workspace), summary=summary(report))

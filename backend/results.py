@@ -8,6 +8,7 @@ from pathlib import Path
 from .maths.sampling import mean_colours
 from .mesh_files import write_glb, write_mesh, write_points, write_sparse
 from .scene import Region, SolvedCameras
+from .stages.camera_report import CameraReport, camera_report_html, camera_report_numbers
 from .stages.nerfstudio import transforms_json
 from .stages.report import Report, render_report_html, report_numbers
 from .workspace import LOG, Workspace
@@ -31,9 +32,13 @@ def write_all(report: Report, workspace: Workspace) -> tuple[str, ...]:
     return (*writers, LOG)
 
 
-def write_cameras(solved: SolvedCameras, region: Region, workspace: Workspace) -> tuple[str, ...]:
+def write_cameras(report: CameraReport, workspace: Workspace) -> tuple[str, ...]:
     """Put in place what is known once the cameras are; the names."""
-    writers = _camera_writers(solved, region)
+    writers: Writers = {
+        **_camera_writers(report.solved, report.region),
+        "cameras_report.json": _text(_json(camera_report_numbers(report))),
+        "cameras.html": _text(camera_report_html(report)),
+    }
     workspace.write_results(writers)
     return (*writers, LOG)
 
@@ -59,14 +64,15 @@ def summary(report: Report) -> tuple[str, ...]:
     return tuple(lines)
 
 
-def cameras_summary(solved: SolvedCameras) -> tuple[str, ...]:
-    """The cameras in a line."""
+def cameras_summary(report: CameraReport) -> tuple[str, ...]:
+    """The cameras in a few lines, and what would make them better."""
+    solved = report.solved
     placed, num_points = len(solved.views), len(solved.sparse_positions)
     total = placed + len(solved.unplaced)
     lines = [f"{placed} of {total} photographs have a camera; they share {num_points} points"]
     if solved.reprojection_error_px is not None:
         lines.append(f"Error of the estimated cameras: {solved.reprojection_error_px:.2f} pixels on average")
-    return tuple(lines)
+    return (*lines, *report.remarks)
 
 
 def _camera_writers(solved: SolvedCameras, region: Region) -> Writers:

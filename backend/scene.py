@@ -123,6 +123,28 @@ class Unplaced:
 
 
 @dataclass(frozen=True, kw_only=True)
+class CameraEvidence:
+    """What estimated cameras rest on. Photographs are all that were given, in their order."""
+
+    names: tuple[str, ...]
+    """Of the photographs."""
+    num_features: Int64[np.ndarray, "photos"]
+    num_matched: Int64[np.ndarray, "photos photos"]
+    """Features of two photographs that look alike; symmetric, 0 on the diagonal."""
+    num_verified: Int64[np.ndarray, "photos photos"]
+    """Of these, those that one geometry of the two explains."""
+    error_px: Float64[np.ndarray, "points views"]
+    """How far beside its sparse point a feature lies, in pixels of the photograph; 0 where it is not seen."""
+    pose_covariance: Float64[np.ndarray, "views 6 6"] | None
+    """Of each camera's orientation (rotation vector, world axes, radians) and centre (world units), in the
+    frame of the cameras as a whole (maths/gauge.py). None where nothing is left over to tell errors from."""
+    lenses_free: bool
+    """Whether that counts what the photographs leave open of the lenses; where they tell nothing of them, not."""
+    point_sigma_world: Float64[np.ndarray, "points"] | None
+    """Standard deviation of each sparse point where it is least sure, the cameras held."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class SolvedCameras:
     """What the camera stage found."""
 
@@ -137,6 +159,8 @@ class SolvedCameras:
     sparse_visibility: Bool[np.ndarray, "points views"]
     reprojection_error_px: float | None
     """Mean over the sparse points, in pixels of the photographs as placed; None where not estimated."""
+    evidence: CameraEvidence | None = None
+    """None where the cameras were given."""
     decisions: tuple[Decision, ...] = ()
 
 

@@ -67,5 +67,6 @@ def solve_cameras(
         sparse_positions=positions,
         sparse_visibility=visibility,
         reprojection_error_px=placement.reprojection_error_px,
+        evidence=placement.evidence,
         decisions=placement.decisions,
     )

@@ -176,10 +176,14 @@ def _sweep(window: Window, sources: list[Window], config: StereoConfig) -> Map:
 
 
 def _inverse_depth_range(camera: Pinhole) -> tuple[float, float]:
-    """(nearest, farthest) inverse depth of the unit sphere, kept in front of the camera."""
+    """(nearest, farthest) inverse depth of the unit sphere, kept in front of the camera.
+
+    Farther by up to a radius, where surroundings find room; no more, because seen through a long lens the
+    sphere is a small share of its distance, and the steps are shared out over all that is searched.
+    """
     middle = float(camera.camera_from_object[2, 3])
     nearest = max(middle - 1.0, 0.05 * (middle + 1.0), 1e-3)
-    return 1 / nearest, 1 / max(middle + 1.0, 2 * nearest)
+    return 1 / nearest, 1 / max(middle + 1.0, min(2 * nearest, max(middle + 2.0, 2e-3)))
 
 
 def _step_of_one_pixel(
@@ -249,7 +253,7 @@ def _smoothed(current: Map, radius: int) -> Float[Tensor, "height width"]:
     median = _median(current.inverse_depth)
     weight = current.score.clamp(min=0.01) ** 2 * current.window.subject
     spread = window_mean((current.inverse_depth - median).abs(), current.window.subject.float(), radius)
-    spread = spread.clamp(min=1e-6)
+    spread = spread.clamp(min=torch.finfo(spread.dtype).tiny)
     weight = weight * torch.exp(-(((current.inverse_depth - median) / (2 * spread)) ** 2))
     value = fit_planes(median, weight, radius)[0]
     return torch.where(window_sum(weight, radius) > 1e-3, value, median)

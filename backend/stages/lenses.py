@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float, Float32, Float64
 from scipy.ndimage import map_coordinates
 
 from ..errors import ErrorCode, ReconstructionError
-from ..scene import Camera, Decision, Lens, Photo, Unplaced, View
+from ..scene import Camera, CameraEvidence, Decision, Lens, Photo, Unplaced, View
 
 SMALLEST_ZOOM, LARGEST_ZOOM = 0.5, 4.0
 """Of the pinhole's focal length against the lens's. Below the first, a wide lens would lose half its
@@ -76,6 +76,8 @@ class Placement:
     """The other photographs, in their order."""
     reprojection_error_px: float | None
     """In pixels of the photographs; None where the cameras were given."""
+    evidence: CameraEvidence | None = None
+    """The same."""
     decisions: tuple[Decision, ...] = ()
 
 
@@ -251,19 +253,26 @@ def rigid_matrix(b_from_a: pycolmap.Rigid3d) -> Float64[np.ndarray, "4 4"]:
     return np.vstack([b_from_a.matrix(), [0.0, 0.0, 0.0, 1.0]])
 
 
+def shared_tracks(model: pycolmap.Reconstruction, image_ids: Sequence[int]) -> dict[int, dict[int, int]]:
+    """For each point that at least two of the images see: the place of such an image among them, and the
+    number of its feature there. Points are in the order of their ids."""
+    column = {image_id: index for index, image_id in enumerate(image_ids)}
+    tracks = {}
+    for point_id, point in sorted(model.points3D.items()):
+        elements = point.track.elements
+        track = {column[e.image_id]: e.point2D_idx for e in elements if e.image_id in column}
+        if len(track) >= 2:
+            tracks[point_id] = track
+    return tracks
+
+
 def sparse_points(
     model: pycolmap.Reconstruction, image_ids: Sequence[int]
 ) -> tuple[Float64[np.ndarray, "points 3"], Bool[np.ndarray, "points images"]]:
     """Positions of the points that at least two of the images see, and which of them do."""
-    column = {image_id: index for index, image_id in enumerate(image_ids)}
-    positions, visibility = [], []
-    for _, point in sorted(model.points3D.items()):
-        seen = np.zeros(len(image_ids), bool)
-        seen[[column[e.image_id] for e in point.track.elements if e.image_id in column]] = True
-        if seen.sum() >= 2:
-            positions.append(point.xyz)
-            visibility.append(seen)
-    return (
-        np.array(positions, np.float64).reshape(-1, 3),
-        np.array(visibility, bool).reshape(-1, len(image_ids)),
-    )
+    tracks = shared_tracks(model, image_ids)
+    visibility = np.zeros((len(tracks), len(image_ids)), bool)
+    for row, track in enumerate(tracks.values()):
+        visibility[row, list(track)] = True
+    positions = [model.points3D[point_id].xyz for point_id in tracks]
+    return np.array(positions, np.float64).reshape(-1, 3), visibility

@@ -9,6 +9,7 @@ import pycolmap
 from jaxtyping import Float64
 
 from ..errors import ErrorCode, ReconstructionError
+from ..maths.angles import widest_angle_deg
 
 _SMALLEST_ANGLE_DEG = 1.0
 _SMALLEST_ANGLE_FLAT_DEG = 2.0
@@ -102,5 +103,5 @@ def widest_angles_deg(model: pycolmap.Reconstruction) -> Float64[np.ndarray, "po
     for point in model.points3D.values():
         rays = np.stack([centres[element.image_id] - point.xyz for element in point.track.elements])
         rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-        angles.append(np.degrees(np.arccos(np.clip((rays @ rays.T).min(), -1.0, 1.0))))
+        angles.append(widest_angle_deg(rays))
     return np.array(angles, np.float64)

@@ -13,7 +13,6 @@ from pathlib import Path
 import numpy as np
 import trimesh
 from jaxtyping import Float32
-from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
 from ..images import fitted_size, resized
 from ..maths.metrics import (
@@ -35,19 +34,8 @@ from ..report_page.pictures import (
     turntable_cameras,
     value_map,
 )
-from ..report_page.wording import (
-    count_text,
-    css_gradient,
-    decibel_text,
-    duration_text,
-    hundred_text,
-    memory_text,
-    percent_text,
-    stage_text,
-)
+from ..report_page.template import filled
 from ..scene import Camera, Decision, Progress, Region, SolvedCameras, SurfaceMesh, SurfacePoints, View
-
-TEMPLATES = Path(__file__).resolve().parents[1] / "report_page"
 
 GUESSED_BELOW, MEASURED_FROM = 0.2, 0.6
 """Support of surface that counts as a guess, and of surface that counts as measured."""
@@ -217,18 +205,8 @@ def mesh_facts(mesh: SurfaceMesh) -> MeshFacts:
 
 def render_report_html(report: Report) -> str:
     """One page without anything outside itself: styles inline, pictures as data URIs."""
-    environment = Environment(loader=FileSystemLoader(TEMPLATES), autoescape=True, undefined=StrictUndefined)
-    environment.filters |= {
-        "count": count_text,
-        "decibels": decibel_text,
-        "duration": duration_text,
-        "gradient": css_gradient,
-        "hundred": hundred_text,
-        "memory": memory_text,
-        "percent": percent_text,
-        "stage": stage_text,
-    }
-    return environment.get_template("page.html.j2").render(
+    return filled(
+        "page.html.j2",
         report=report,
         inputs=report.inputs,
         mesh=report.mesh,

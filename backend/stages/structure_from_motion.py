@@ -16,6 +16,7 @@ from jaxtyping import Float32, UInt8
 
 from ..images import fitted_size, read_image, resized
 from ..scene import Decision, Photo, Progress, Unplaced
+from .camera_evidence import camera_evidence
 from .lens_refinement import refine_lenses
 from .lenses import PlacedPhoto, Placement, rigid_matrix, sparse_points
 from .parallax import require_parallax, why_none_placed, why_unplaced
@@ -303,8 +304,8 @@ def _placement(
     seen = {index for index, _ in images}
     missing = [index for index in range(len(photos)) if index not in seen]
     why = why_unplaced(database, [picture_name(index) for index in missing])
-    first = placed[0]
-    photo_px_per_picture_px = photos[first.index].image_srgb.shape[1] / first.lens.width
+    photo_px_per_picture_px = [photos[p.index].image_srgb.shape[1] / p.lens.width for p in placed]
+    names = {picture_name(index): photo.name for index, photo in enumerate(photos)}
     return Placement(
         placed=placed,
         unplaced=tuple(
@@ -312,6 +313,7 @@ def _placement(
         ),
         sparse_positions=positions,
         sparse_visibility=visibility,
-        reprojection_error_px=model.compute_mean_reprojection_error() * photo_px_per_picture_px,
+        reprojection_error_px=model.compute_mean_reprojection_error() * photo_px_per_picture_px[0],
+        evidence=camera_evidence(model, database, names, [i for _, i in images], photo_px_per_picture_px),
         decisions=decisions,
     )

@@ -79,10 +79,12 @@ def two_view_points(
     """
     ray_a, ray_b = _rays(a, pixels_a), _rays(b, pixels_b)
     apart = b.position - a.position
-    cosine = (ray_a * ray_b).sum(axis=1)
-    sine2 = np.maximum(1 - cosine**2, 1e-12)
-    along_a = (ray_a @ apart - cosine * (ray_b @ apart)) / sine2
-    along_b = (cosine * (ray_a @ apart) - ray_b @ apart) / sine2
+    # by cross products: 1 - cosine^2 has no digits left where rays are nearly parallel
+    across = np.cross(ray_a, ray_b)
+    sine2 = (across**2).sum(axis=1)
+    inverse = 1 / np.where(sine2 > 0, sine2, 1.0)
+    along_a = (np.cross(apart, ray_b) * across).sum(axis=1) * inverse
+    along_b = (np.cross(apart, ray_a) * across).sum(axis=1) * inverse
     on_a, on_b = a.position + along_a[:, None] * ray_a, b.position + along_b[:, None] * ray_b
     gap = np.linalg.norm(on_a - on_b, axis=1) / 2
     error_px = np.maximum(gap * a.fx_px / np.abs(along_a), gap * b.fx_px / np.abs(along_b))

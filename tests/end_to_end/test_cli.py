@@ -27,6 +27,7 @@ ROOT = Path(__file__).resolve().parents[2]
 FAKE_STAGES = Path(__file__).with_name("fake_stages.py")
 STAGES = ["photos", "cameras", "region", "stereo", "train", "mesh"]
 CAMERA_RESULTS = {"cameras.json", "sparse.ply", "log.txt"}
+CAMERA_PAGES = {"cameras.html", "cameras_report.json"}
 RESULTS = CAMERA_RESULTS | {"mesh.ply", "mesh.glb", "points.ply", "report.json", "report.html"}
 posix_only = pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX")
 
@@ -440,9 +441,9 @@ def converse(case: Case, step_s: float = 0.0, **changes: object) -> list[Message
 def test_a_run_may_end_with_the_cameras_and_a_later_one_goes_on(case: Case) -> None:
     heard = converse(case, until="cameras")
     assert isinstance(heard[-1], Finished)
-    assert set(heard[-1].files) == CAMERA_RESULTS
+    assert set(heard[-1].files) == CAMERA_RESULTS | CAMERA_PAGES
     assert counted_stages(heard) == [("photos", 1, 3), ("cameras", 2, 3), ("region", 3, 3)]
-    assert set(case.results()) == CAMERA_RESULTS
+    assert set(case.results()) == CAMERA_RESULTS | CAMERA_PAGES
     assert b"element vertex 2\n" in (case.output / "sparse.ply").read_bytes()
     told = json.loads((case.output / "cameras.json").read_text())
     assert [frame["file_path"] for frame in told["frames"]] == ["1.png", "2.png"]
@@ -454,7 +455,23 @@ def test_a_run_may_end_with_the_cameras_and_a_later_one_goes_on(case: Case) -> N
     assert case.done() == STAGES[3:]
     assert converse(case, until="cameras")[-1] == heard[-1]
     assert case.done() == []
-    assert set(case.results()) == RESULTS, "what the whole run left stays"
+    assert set(case.results()) == RESULTS | CAMERA_PAGES, "what the whole run left stays"
+
+
+def test_cameras_alone_on_a_terminal(case: Case) -> None:
+    """The same stages as those of a whole run, which goes on from there."""
+    command = [*case.command()[:-1], "cameras", str(case.photos), "--output", str(case.output)]
+    result = case.finish(command)
+    assert result.returncode == 0, result.stderr
+    assert "2 of 3 photographs have a camera" in result.stdout
+    assert "0.png could not be placed: on purpose." in result.stdout
+    assert "[2/3] cameras done" in result.stderr
+    assert set(case.results()) == CAMERA_RESULTS | CAMERA_PAGES
+    numbers = json.loads((case.output / "cameras_report.json").read_text())
+    assert [photo["why_unplaced"] for photo in numbers["photos"]] == [None, None, "on purpose"]
+    assert case.done() == STAGES[:3]
+    assert case.run().returncode == 0
+    assert case.done() == STAGES[3:]
 
 
 def test_a_given_region_is_used_and_what_hangs_on_it_is_redone(case: Case) -> None:
