@@ -117,7 +117,6 @@ def refine(
     began_s = deadline.clock()
     step, done = 0, 0.0
     safe = SafeSteps(optimiser)
-    schedule = torch.optim.lr_scheduler.LambdaLR(optimiser, lambda _: safe.length * 0.1**done)
     while done < 1 and not safe.hopeless:
         if step % 10 == 0:
             progress(done, f"rendering at {field.nodes}^3, step {step} of {steps}")
@@ -126,10 +125,9 @@ def refine(
         sharpness = 1 / (h * (1.0 - 0.5 * done))
         loss = _ray_loss(field, whole, scene, pixels, sharpness, config, generator)
         loss = loss + _point_loss(field, scene, config, generator) + _shape_loss(field, generator)
-        safe.take(loss)
+        safe.take(loss, 0.1**done)
         step += 1
         done = max(step / steps, deadline.share_gone(began_s))
-        schedule.step()
     if safe.hopeless:
         return Refined(distance=distance, steps=0, taken_back=safe.taken_back)
     return Refined(distance=field.whole(), steps=step, taken_back=safe.taken_back)

@@ -15,12 +15,8 @@ class SafeSteps:
         self.taken_back = 0
         self._optimiser = optimiser
         self._parameters: list[Tensor] = [p for group in optimiser.param_groups for p in group["params"]]
+        self._rates: list[float] = [group["lr"] for group in optimiser.param_groups]
         self.keep()
-
-    @property
-    def length(self) -> float:
-        """What to multiply step sizes with: halved each time."""
-        return 0.5**self.taken_back
 
     @property
     def hopeless(self) -> bool:
@@ -31,8 +27,14 @@ class SafeSteps:
         """Remember the parameters as they are."""
         self._kept = [parameter.detach().clone() for parameter in self._parameters]
 
-    def take(self, loss: Float[Tensor, ""]) -> None:
-        """One step down the loss, or back; the optimiser's memory of a bad way goes with it."""
+    def take(self, loss: Float[Tensor, ""], length: float = 1.0) -> None:
+        """One step down the loss, or back; the optimiser's memory of a bad way goes with it.
+
+        `length` is a share of the learning rates that the optimiser had at first; each step that was taken
+        back has halved it.
+        """
+        for group, rate in zip(self._optimiser.param_groups, self._rates, strict=True):
+            group["lr"] = rate * (length * 0.5**self.taken_back)
         self._optimiser.zero_grad(set_to_none=True)
         torch.autograd.backward(loss)
         gradients = [p.grad.sum() for p in self._parameters if p.grad is not None]

@@ -1,4 +1,4 @@
-"""Numbers too small to be held in full: the CPU is slow with them, so a run takes them for 0, in every thread."""
+"""Numbers too small to be held in full slow some CPUs down: a run takes them for 0, in every thread."""
 
 import subprocess
 import sys

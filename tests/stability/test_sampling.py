@@ -34,7 +34,7 @@ def with_epsilons(edges: Tensor, weights: Tensor, shares: Tensor) -> Tensor:
 
 
 def spikes() -> list[tuple[Tensor, Tensor, Tensor]]:
-    """Edges from 0 to 1; the weight of one interval, of any size down to denormal, and 0 or hardly any elsewhere."""
+    """Edges, weights, and the one interval that has them: of any size; 0 or hardly any elsewhere."""
     cases = []
     for count in INTERVALS:
         edges = torch.linspace(0, 1, count + 1).expand(8, -1).contiguous()
