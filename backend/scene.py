@@ -166,7 +166,7 @@ class Region:
 
 @dataclass(frozen=True, kw_only=True)
 class SurfacePoints:
-    """Points on the surface as stereo saw them, object frame."""
+    """Points on the surface as stereo saw them, object frame; ValueError where one of them is not finite."""
 
     positions: Float32[np.ndarray, "points 3"]
     normals: Float32[np.ndarray, "points 3"]
@@ -179,6 +179,11 @@ class SurfacePoints:
     view_index: Int64[np.ndarray, "points"]
     """The photograph whose depth map the point comes from."""
     decisions: tuple[Decision, ...] = ()
+
+    def __post_init__(self) -> None:
+        for name in ("positions", "normals", "colours_srgb", "confidence"):
+            if not np.isfinite(getattr(self, name)).all():
+                raise ValueError(f"{name} of surface points hold numbers that are not finite")
 
 
 @dataclass(frozen=True, kw_only=True)
