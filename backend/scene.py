@@ -139,7 +139,7 @@ class CameraEvidence:
     """Of each camera's orientation (rotation vector, world axes, radians) and centre (world units), in the
     frame of the cameras as a whole (maths/gauge.py). None where nothing is left over to tell errors from."""
     lenses_free: bool
-    """Whether that counts what the photographs leave open of the lenses; where they tell nothing of them, not."""
+    """Whether that counts what photographs leave open of the lenses; where they tell nothing of them, not."""
     point_sigma_world: Float64[np.ndarray, "points"] | None
     """Standard deviation of each sparse point where it is least sure, the cameras held."""
 
@@ -190,7 +190,7 @@ class Region:
 
 @dataclass(frozen=True, kw_only=True)
 class SurfacePoints:
-    """Points on the surface as stereo saw them, object frame."""
+    """Points on the surface as stereo saw them, object frame; ValueError where one of them is not finite."""
 
     positions: Float32[np.ndarray, "points 3"]
     normals: Float32[np.ndarray, "points 3"]
@@ -203,6 +203,11 @@ class SurfacePoints:
     view_index: Int64[np.ndarray, "points"]
     """The photograph whose depth map the point comes from."""
     decisions: tuple[Decision, ...] = ()
+
+    def __post_init__(self) -> None:
+        for name in ("positions", "normals", "colours_srgb", "confidence"):
+            if not np.isfinite(getattr(self, name)).all():
+                raise ValueError(f"{name} of surface points hold numbers that are not finite")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -40,8 +40,8 @@ def node_positions(nodes: int, device: torch.device) -> Float[Tensor, "nodes nod
 
 def locate(points: Float[Tensor, "points 3"], nodes: int) -> Corners:
     """The cell of each point; points outside the cube are moved to its side."""
-    scaled = ((points + 1) * (0.5 * (nodes - 1))).clamp(0, nodes - 1 - 1e-4)
-    low = scaled.floor()
+    scaled = ((points + 1) * (0.5 * (nodes - 1))).clamp(0, nodes - 1)
+    low = scaled.floor().clamp(max=nodes - 2)  # the last node belongs to the last cell
     t = scaled - low
     base = low.long()
     flat = (base[:, 0] * nodes + base[:, 1]) * nodes + base[:, 2]
@@ -128,10 +128,14 @@ def laplacian_at(
     index: Int[Tensor, "chosen"],
     nodes: int,
 ) -> Float[Tensor, "chosen"]:
-    """The same at chosen inner nodes (flat numbers), for a function of flat node numbers."""
-    offsets = torch.tensor([0, 1, -1, nodes, -nodes, nodes * nodes, -nodes * nodes], device=index.device)
-    around = node_values((index[:, None] + offsets).clamp(0, nodes**3 - 1))
-    return around[:, 1:].sum(dim=-1) - 6 * around[:, 0]
+    """The same at chosen nodes (flat numbers), for a function of flat node numbers."""
+    strides = torch.tensor([1, nodes, nodes * nodes], device=index.device)
+    here = index[:, None]
+    place = here // strides % nodes
+    # beyond a side stands the node itself: no difference, nothing flows
+    around = torch.cat([here + strides * (place < nodes - 1), here - strides * (place > 0), here], dim=-1)
+    values = node_values(around)
+    return (values[:, :6] - values[:, 6:]).sum(dim=-1)
 
 
 def near_surface(grid: Float[Tensor, "nodes nodes nodes"], cells: int) -> Bool[Tensor, "nodes nodes nodes"]:

@@ -28,14 +28,18 @@ def taylor_at_point(
 
 
 def charbonnier(residual: Float[Tensor, "*batch"], scale: float) -> Float[Tensor, "*batch"]:
-    """Quadratic below `scale`, then as the absolute value: outliers pull, but no harder than others."""
+    """Quadratic below `scale`, then as the absolute value: outliers pull, but no harder than others.
+
+    scale (sqrt(1 + x^2) - 1) with x = residual / scale, without the difference, which is 0 for small x.
+    """
     scaled = residual / scale
-    return scale * (torch.sqrt(1 + scaled * scaled) - 1)
+    return residual * scaled / (torch.sqrt(1 + scaled * scaled) + 1)
 
 
 def eikonal(gradient: Float[Tensor, "points 3"]) -> Float[Tensor, ""]:
-    """Mean of (|grad f| - 1)^2; finite, with finite derivative, also where the gradient vanishes."""
-    return (torch.sqrt((gradient * gradient).sum(dim=-1) + 1e-12) - 1).square().mean()
+    """Mean of (|grad f| - 1)^2; where the gradient vanishes, its derivative is taken to be 0."""
+    length: Tensor = torch.linalg.vector_norm(gradient, dim=-1)
+    return (length - 1).square().mean()
 
 
 def silhouette(log_pass: Float[Tensor, "rays"], coverage: Float[Tensor, "rays"]) -> Float[Tensor, ""]:
@@ -52,7 +56,8 @@ def silhouette(log_pass: Float[Tensor, "rays"], coverage: Float[Tensor, "rays"])
 def entropy_of_side(distance: Float[Tensor, "points"], sharpness: float) -> Float[Tensor, "points"]:
     """Entropy of being inside or outside, in nats; log 2 on the surface, 0 far from it.
 
-    H(Phi(s f)) after SparseOcc (Ouasfi and Boukhayma, CVPR 2024), from logits: no log of 0.
+    H(Phi(s f)) after SparseOcc (Ouasfi and Boukhayma, CVPR 2024), from logits: no log of 0. It is the same on
+    both sides; of the absolute logit both terms are positive, and nothing cancels.
     """
-    logit = sharpness * distance
-    return softplus(logit) - logit * torch.sigmoid(logit)
+    logit = sharpness * distance.abs()
+    return softplus(-logit) + logit * torch.sigmoid(-logit)

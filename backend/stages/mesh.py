@@ -32,6 +32,9 @@ KeptFaces = Int64[np.ndarray, "kept_faces 3"]
 MEASURED_EDGES = 0.03
 """Share of the pictures' edges. Measured: 0 to 0.001 for objects, 0.06 to 0.5 for facades and floors."""
 
+_LEAST_CELLS = 1e-3
+"""How near to a node, in cells, the level set may cross an edge: through a node it has faces without area."""
+
 PREVIEW_NODES, PREVIEW_FACES = 64, 20_000
 """Of a mesh that is only looked at: at most so many nodes along each axis, and faces."""
 
@@ -136,8 +139,10 @@ def level_set(surface: Surface) -> tuple[Vertices, Faces]:
             "Check that the photographs show the same thing, and that masks, if any, are white on it.",
         )
     near = near_surface(torch.from_numpy(distance), 2).numpy()
+    least = np.float32(_LEAST_CELLS * spacing(nodes))
+    apart = np.where(distance < 0, np.minimum(distance, -least), np.maximum(distance, least))
     vertices, faces, _, _ = marching_cubes(  # type: ignore[no-untyped-call]
-        distance, 0.0, spacing=(spacing(nodes),) * 3, gradient_direction="descent", mask=near
+        apart, 0.0, spacing=(spacing(nodes),) * 3, gradient_direction="descent", mask=near
     )
     world_from_grid = np.linalg.inv(surface.grid_from_world)
     return transform_points(world_from_grid, vertices.astype(np.float64) - 1), faces.astype(np.int64)

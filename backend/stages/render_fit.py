@@ -21,6 +21,7 @@ from ..scene import Progress
 from .deadline import Deadline
 from .field import SurfaceField
 from .measurements import Measurements
+from .safe_steps import SafeSteps
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,6 +32,17 @@ class RenderConfig:
     edges: int = 9
     """Edges of the intervals on each ray."""
     point_queries: int = 4096
+
+
+@dataclass(frozen=True, kw_only=True)
+class Refined:
+    """A field after gradient steps."""
+
+    distance: Float[Tensor, "nodes nodes nodes"]
+    steps: int
+    """How many were tried; 0 where the field is what it was before them."""
+    taken_back: int
+    """How many of those tried had a loss or a gradient that is not finite."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -83,10 +95,11 @@ def refine(
     generator: torch.Generator,
     progress: Progress,
     deadline: Deadline,
-) -> tuple[Float[Tensor, "nodes nodes nodes"], int]:
-    """The field after some steps, and how many: at most `steps`, and none after the deadline.
+) -> Refined:
+    """The field after at most `steps`, and none after the deadline.
 
-    Step sizes shrink with the share that is done, of the steps or of the time, whichever ends first.
+    Step sizes shrink with the share that is done, of the steps or of the time, whichever ends first. After
+    too many steps that are not finite the field is what it was before the first.
     """
     field = SurfaceField(distance, band_cells=4, channels=6, view_dependent=False, generator=generator)
     _colour_from_points(field, scene)
@@ -103,21 +116,21 @@ def refine(
     )
     began_s = deadline.clock()
     step, done = 0, 0.0
-    schedule = torch.optim.lr_scheduler.LambdaLR(optimiser, lambda _: 0.1**done)
-    while done < 1:
+    safe = SafeSteps(optimiser)
+    while done < 1 and not safe.hopeless:
         if step % 10 == 0:
             progress(done, f"rendering at {field.nodes}^3, step {step} of {steps}")
+            safe.keep()
             whole = field.whole()
         sharpness = 1 / (h * (1.0 - 0.5 * done))
         loss = _ray_loss(field, whole, scene, pixels, sharpness, config, generator)
         loss = loss + _point_loss(field, scene, config, generator) + _shape_loss(field, generator)
-        optimiser.zero_grad(set_to_none=True)
-        torch.autograd.backward(loss)
-        optimiser.step()
+        safe.take(loss, 0.1**done)
         step += 1
         done = max(step / steps, deadline.share_gone(began_s))
-        schedule.step()
-    return field.whole(), step
+    if safe.hopeless:
+        return Refined(distance=distance, steps=0, taken_back=safe.taken_back)
+    return Refined(distance=field.whole(), steps=step, taken_back=safe.taken_back)
 
 
 def _colour_from_points(field: SurfaceField, scene: Measurements) -> None:

@@ -64,18 +64,19 @@ def match_views(
         nearby = neighbours([sizes[0].camera for sizes in pyramids], config.num_sources)
         sizes = depth_maps(pyramids, nearby, config, within(progress, 0.0, 0.95))
         points = _points(views, sizes, config)
-    _check_enough(points)
+    _check_enough(points, masked=any(view.mask is not None for view in views))
     full_size = (_full_size(view, maps, region, config) for view, maps in zip(views, sizes, strict=True))
     return StereoResult(points=points, depth_maps=tuple(full_size))
 
 
-def _check_enough(points: SurfacePoints) -> None:
+def _check_enough(points: SurfacePoints, *, masked: bool) -> None:
     if len(points.positions) < 100:
+        masks = " Check that the masks are white on the subject and belong to these photographs."
         raise ReconstructionError(
             ErrorCode.NO_SURFACE,
             f"The photographs agree on only {len(points.positions)} points of the surface.",
             "Take photographs that overlap by more than half, sharp and evenly lit; shiny, transparent "
-            "or plain surfaces need masks, or some texture such as dust or chalk.",
+            "or plain surfaces need masks, or some texture such as dust or chalk." + masks * masked,
         )
 
 

@@ -93,7 +93,7 @@ def fit_surface(
         scene = measurements(views, region, frame, stereo, device)
         distance = start(scene, radius, config.levels[0])
     total = sum(config.steps) + 10 * len(config.levels)
-    done, rendered = 0, 0
+    done, rendered, taken_back = 0, 0, 0
     for wanted, rounds, steps in zip(config.levels, config.rounds, config.steps, strict=True):
         nodes = finest_grid(costs, len(distance), wanted, deadline.left_s())
         if nodes == len(distance) < wanted:
@@ -107,10 +107,13 @@ def fit_surface(
         costs.append(GridCost(nodes=nodes, seconds=clock() - began_s))
         if steps:
             tell = within(progress, done / total, (done + steps) / total)
-            distance, taken = refine(scene, distance, steps, config.render, generator, tell, deadline)
-            rendered += taken
+            better = refine(scene, distance, steps, config.render, generator, tell, deadline)
+            distance = better.distance
+            rendered += better.steps
+            taken_back += better.taken_back
             done += steps
     made = _decisions(scene, frame, config, depth, nodes=len(distance), rendered=rendered)
+    made = (*made, _of_rendering(config, rendered, taken_back))
     if config.budget_s is not None:
         used_s = config.budget_s - deadline.left_s()
         made = (*made, _of_budget(config.budget_s, used_s, config, costs, rendered))
@@ -146,8 +149,7 @@ def _decisions(
     masks = sum(outline is not None for outline in scene.outlines)
     backdrops = sum(backdrop is not None for backdrop in scene.backdrops)
     cell = spacing(nodes) * frame.radius_world
-    as_asked = nodes == config.levels[-1] and rendered == sum(config.steps)
-    asked = "the preset" if as_asked else "the time given"
+    asked = _who_asked(config, nodes == config.levels[-1] and rendered == sum(config.steps))
     made = [
         Decision(
             what="grid",
@@ -161,13 +163,24 @@ def _decisions(
         ),
         depth,
         Decision(what="background", choice="left out", because="rays that miss the subject are not rendered"),
-        Decision(
-            what="refinement by rendering",
-            choice=f"{rendered} steps" if rendered else "left out",
-            because=asked,
-        ),
     ]
     return tuple(made)
+
+
+def _of_rendering(config: TrainConfig, rendered: int, taken_back: int) -> Decision:
+    """How many gradient steps there were, and whether all of them went well."""
+    what, because = "refinement by rendering", _who_asked(config, rendered == sum(config.steps))
+    if not taken_back:
+        return Decision(what=what, choice=f"{rendered} steps" if rendered else "left out", because=because)
+    numbers = f"{taken_back} steps led to numbers that are not finite"
+    if not rendered:
+        return Decision(what=what, choice="left out", because=f"{numbers}; so the field before them stands")
+    because += f"; {numbers}, were taken back and shortened"
+    return Decision(what=what, choice=f"{rendered} steps", because=because)
+
+
+def _who_asked(config: TrainConfig, all_done: bool) -> str:
+    return "the preset" if all_done or config.budget_s is None else "the time given"
 
 
 def _tight_frame(distance: Float[Tensor, "nodes nodes nodes"], region: Region) -> Region:

@@ -50,6 +50,11 @@ def test_charbonnier_is_a_square_near_zero_and_a_distance_far_away() -> None:
     torch.testing.assert_close(losses.charbonnier(residual, scale), losses.charbonnier(-residual, scale))
 
 
+def test_charbonnier_is_right_where_one_plus_its_square_is_one() -> None:
+    residual = torch.tensor([1e-3, 1e-6, 1e-12])
+    torch.testing.assert_close(losses.charbonnier(residual, 10.0), residual.square() / 20, rtol=1e-6, atol=0)
+
+
 def test_charbonnier_pulls_no_harder_than_one() -> None:
     residual = torch.tensor([-1e4, -1.0, 0.0, 1.0, 1e4], requires_grad=True)
     value = losses.charbonnier(residual, 0.02)
@@ -105,6 +110,13 @@ def test_entropy_of_side_is_that_of_a_coin() -> None:
     plain = -inside * inside.log() - (1 - inside) * (1 - inside).log()
     torch.testing.assert_close(losses.entropy_of_side(distance, 8.0), plain)
     assert losses.entropy_of_side(torch.zeros(1), 8.0).item() == pytest.approx(math.log(2))
+
+
+@pytest.mark.parametrize("logit", [-60.0, -20.0, 20.0, 60.0])
+def test_entropy_of_side_is_right_where_a_side_is_nearly_sure(logit: float) -> None:
+    """To first order (1 + x) e^-x, which float32 holds to its last digits."""
+    value = losses.entropy_of_side(torch.tensor([logit / 4]), 4.0).item()
+    assert value == pytest.approx((1 + abs(logit)) * math.exp(-abs(logit)), rel=1e-6, abs=0)
 
 
 def test_entropy_of_side_is_finite_far_away() -> None:

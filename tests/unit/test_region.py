@@ -1,5 +1,6 @@
 """The region holds the subject, is not much larger than it, and does not depend on the world's frame."""
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -100,6 +101,23 @@ def test_an_empty_mask_is_told_by_name() -> None:
     with pytest.raises(ReconstructionError, match="view_01") as raised:
         region_of(replace(solved, views=(solved.views[0], empty, solved.views[2])))
     assert raised.value.code == ErrorCode.MASK_UNUSABLE
+
+
+@pytest.mark.parametrize("cameras", [ring_cameras(6, 80), arc_cameras(3, 50, 160)])
+def test_masks_that_have_hardly_anything_in_common_are_told(cameras: list[Camera]) -> None:
+    """One of them is inverted; one that is off by a twentieth of the picture passes."""
+    scene = photographed(cameras)
+
+    def with_first_mask(change: Callable[[np.ndarray], np.ndarray]) -> SolvedCameras:
+        first, *others = scene.views
+        assert first.mask is not None
+        changed = replace(first, mask=change(first.mask).astype(np.float32))
+        return replace(scene, views=(changed, *others)).solved()
+
+    with pytest.raises(ReconstructionError, match="The masks contradict each other") as raised:
+        region_of(with_first_mask(lambda mask: 1 - mask))
+    assert raised.value.code == ErrorCode.MASK_UNUSABLE
+    region_of(with_first_mask(lambda mask: np.roll(mask, mask.shape[1] // 20, axis=1)))
 
 
 def test_masks_in_conflict_are_told() -> None:

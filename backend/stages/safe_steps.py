@@ -1,0 +1,48 @@
+"""Gradient steps that notice when a number is not finite, and go back to where all was well."""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+PATIENCE = 5
+"""Steps that may be taken back before it is better to stop: the last ones were a sixteenth as long."""
+
+
+class SafeSteps:
+    """Steps of an optimiser; one whose loss or gradient is not finite is taken back to the last `keep`."""
+
+    def __init__(self, optimiser: torch.optim.Optimizer) -> None:
+        self.taken_back = 0
+        self._optimiser = optimiser
+        self._parameters: list[Tensor] = [p for group in optimiser.param_groups for p in group["params"]]
+        self._rates: list[float] = [group["lr"] for group in optimiser.param_groups]
+        self.keep()
+
+    @property
+    def hopeless(self) -> bool:
+        """Whether so many steps were taken back that what they lead to is not to be trusted."""
+        return self.taken_back >= PATIENCE
+
+    def keep(self) -> None:
+        """Remember the parameters as they are."""
+        self._kept = [parameter.detach().clone() for parameter in self._parameters]
+
+    def take(self, loss: Float[Tensor, ""], length: float = 1.0) -> None:
+        """One step down the loss, or back; the optimiser's memory of a bad way goes with it.
+
+        `length` is a share of the learning rates that the optimiser had at first; each step that was taken
+        back has halved it.
+        """
+        for group, rate in zip(self._optimiser.param_groups, self._rates, strict=True):
+            group["lr"] = rate * (length * 0.5**self.taken_back)
+        self._optimiser.zero_grad(set_to_none=True)
+        torch.autograd.backward(loss)
+        gradients = [p.grad.sum() for p in self._parameters if p.grad is not None]
+        if bool(torch.stack([loss.detach(), *gradients]).isfinite().all()):
+            self._optimiser.step()
+            return
+        self.taken_back += 1
+        self._optimiser.state.clear()
+        with torch.no_grad():
+            for parameter, kept in zip(self._parameters, self._kept, strict=True):
+                parameter.copy_(kept)

@@ -1,0 +1,292 @@
+"""Distances on a grid where it is delicate: at borders of cells and of the box, and without a gradient."""
+
+from collections.abc import Callable
+
+import pytest
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from backend.maths import losses
+from backend.maths.grid import (
+    interpolate,
+    laplacian,
+    laplacian_at,
+    locate,
+    node_positions,
+    spacing,
+    value_and_gradient,
+)
+from backend.maths.rays import sphere_entry
+from tests.stability.sweep import Sweep, check, gradient, largest
+
+CPU = torch.device("cpu")
+NODES = (2, 3, 47, 96, 192)
+
+
+def ball(nodes: int) -> Tensor:
+    """Distances to a ball, in float64."""
+    return node_positions(nodes, CPU).double().norm(dim=-1) - 0.6
+
+
+def border_points(nodes: int) -> Tensor:
+    """On nodes, a digit to either side of them, on the box's sides, and beyond."""
+    generator = torch.Generator().manual_seed(0)
+    node = torch.randint(nodes, (300, 3), generator=generator)
+    on = node * spacing(nodes) - 1
+    away = torch.nextafter(on, torch.full_like(on, 9.0))
+    towards = torch.nextafter(on, torch.full_like(on, -9.0))
+    side = 2 * torch.rand((300, 3), generator=generator) - 1
+    side[torch.arange(300), node[:, 0] % 3] = torch.where(node[:, 1] % 2 == 0, 1.0, -1.0)
+    return torch.cat([on, away, towards, side, 1.5 * side])
+
+
+# interpolation
+
+
+def stopped_short(points: Tensor, nodes: int) -> Tensor:
+    """The ball's distance, with places kept from the last node by a ten-thousandth of a cell."""
+    scaled = ((points + 1) * (0.5 * (nodes - 1))).clamp(0, nodes - 1 - 1e-4)
+    return interpolate(ball(nodes).float(), locate(scaled * spacing(nodes) - 1, nodes))
+
+
+def interpolated(points: Tensor, nodes: int) -> Tensor:
+    return interpolate(ball(nodes).to(points.dtype), locate(points, nodes))
+
+
+def border_error(value: Callable[[Tensor, int], Tensor]) -> float:
+    """Largest, in units of the box's half side."""
+    cases = [(border_points(nodes), nodes) for nodes in NODES]
+    return max(largest(value(points, n), interpolated(points.double(), n)) for points, n in cases)
+
+
+# lengths of gradients
+
+
+def gradients() -> Tensor:
+    """Vectors of length 0 to 1e4 in all directions, many of them denormal."""
+    lengths = torch.cat([torch.zeros(1), 10.0 ** torch.arange(-44, 5)])
+    directions = F.normalize(torch.randn((20, 3), generator=torch.Generator().manual_seed(0)), dim=-1)
+    return (lengths[:, None, None] * directions).reshape(-1, 3)
+
+
+def plain_eikonal(g: Tensor) -> Tensor:
+    return (g.square().sum(dim=-1).sqrt() - 1).square().mean()
+
+
+def eikonal_slope_error(loss: Callable[[Tensor], Tensor]) -> float:
+    """Of the derivative 2 (|g| - 1) g / |g|; where |g|^2 is denormal, only that it is of a size like that."""
+    g = gradients()
+    found = gradient(loss, g) * len(g)
+    length = g.double().norm(dim=-1, keepdim=True)
+    exact = 2 * (length - 1) * g.double() / length
+    sharp = length[:, 0] > 1e-18
+    too_large = float((found.norm(dim=-1) - 4).clamp(min=0)[~sharp].max())
+    return max(largest(found[sharp], exact[sharp], 1 + length[sharp]), largest(found, found), too_large)
+
+
+# Taylor residuals
+
+
+def taylor_cases() -> tuple[Tensor, Tensor, Tensor]:
+    """Distances, gradients, and offsets to a measured point."""
+    g = gradients()
+    generator = torch.Generator().manual_seed(1)
+    return 0.1 * torch.randn(len(g), generator=generator), g, 0.1 * torch.randn(g.shape, generator=generator)
+
+
+def pulled(distance: Tensor, g: Tensor, p_minus_q: Tensor) -> Tensor:
+    """Neural-Pull (Ma et al., ICML 2021): how far p lies from q moved by f along g / |g|."""
+    return (p_minus_q + distance[:, None] * g / g.norm(dim=-1, keepdim=True)).norm(dim=-1)
+
+
+def taylor_error(residual: Callable[[Tensor, Tensor, Tensor], Tensor]) -> float:
+    """Of the residual and of its derivative by the gradient, in shares of 1 + |g|."""
+    distance, g, p_minus_q = taylor_cases()
+    size = 1 + g.double().norm(dim=-1)
+    exact = distance.double() + (g.double() * p_minus_q.double()).sum(dim=-1)
+    value = residual(distance, g, p_minus_q)
+    slope = gradient(lambda x: residual(distance, x, p_minus_q), g)
+    return max(largest(value, exact, size), largest(slope, p_minus_q))
+
+
+# curvature
+
+
+def wrapping_laplacian(grid: Tensor) -> Tensor:
+    """Neighbours by flat number, the sum of six less six times the middle."""
+    nodes = len(grid)
+    offsets = torch.tensor([1, -1, nodes, -nodes, nodes * nodes, -nodes * nodes])
+    around = (torch.arange(nodes**3)[:, None] + offsets).clamp(0, nodes**3 - 1)
+    flat = grid.flatten()
+    return flat[around].sum(dim=-1) - 6 * flat
+
+
+def our_laplacian(grid: Tensor) -> Tensor:
+    nodes = len(grid)
+    return laplacian_at(lambda index: grid.flatten()[index], torch.arange(nodes**3), nodes)
+
+
+def laplacian_error(bent: Callable[[Tensor], Tensor]) -> float:
+    """At every node of a ball's distances, in cells."""
+    worst = 0.0
+    for nodes in NODES[:-1]:
+        grid = ball(nodes).float()
+        worst = max(
+            worst, largest(bent(grid) / spacing(nodes), laplacian(grid.double()).flatten() / spacing(nodes))
+        )
+    return worst
+
+
+# small losses
+
+
+def relative_error(
+    function: Callable[[Tensor], Tensor], exact: Callable[[Tensor], Tensor], at: Tensor
+) -> float:
+    truth = exact(at.double())
+    return largest(function(at), truth, truth)
+
+
+def residuals() -> Tensor:
+    return 10.0 ** torch.arange(-12, 5)
+
+
+def exact_charbonnier(x: Tensor) -> Tensor:
+    """With scale 1; in float64 right to 1e-8 from x = 1e-4 on, and there x^2 / 2 begins to be."""
+    return torch.where(x < 1e-4, x.square() / 2, torch.hypot(torch.ones_like(x), x) - 1)
+
+
+def logits() -> Tensor:
+    return torch.linspace(-80, 80, 161)
+
+
+def exact_entropy(x: Tensor) -> Tensor:
+    """In float64 by the two probabilities, each from its own side."""
+    inside, outside = torch.sigmoid(-x), torch.sigmoid(x)
+    return -inside * F.logsigmoid(-x) - outside * F.logsigmoid(x)
+
+
+# where rays enter
+
+
+def far_rays() -> tuple[Tensor, Tensor]:
+    """Towards the unit sphere from 2 to 1e4 away."""
+    generator = torch.Generator().manual_seed(0)
+    away = 10.0 ** torch.linspace(0.3, 4, 200)[:, None]
+    origins = away * F.normalize(torch.randn((200, 3), generator=generator), dim=-1)
+    targets = 0.5 * F.normalize(torch.randn((200, 3), generator=generator), dim=-1)
+    return origins, F.normalize(targets - origins, dim=-1)
+
+
+def by_discriminant(origins: Tensor, directions: Tensor) -> Tensor:
+    b = (origins * directions).sum(dim=-1)
+    return -b - (b * b - origins.square().sum(dim=-1) + 1).sqrt()
+
+
+def entry_error(entry: Callable[[Tensor, Tensor], Tensor]) -> float:
+    """In shares of the way."""
+    origins, directions = far_rays()
+    unit = F.normalize(directions.double(), dim=-1)
+    exact = by_discriminant(origins.double(), unit)
+    return largest(entry(origins, directions), exact, exact)
+
+
+SWEEPS = (
+    Sweep(
+        what="distance on nodes, a digit beside them, on and beyond the box; 2 to 192 nodes",
+        usual_formula="stopping 1e-4 of a cell before the last node",
+        usual=lambda: border_error(stopped_short),
+        ours=lambda: border_error(interpolated),
+        tolerance=1e-6,
+    ),
+    Sweep(
+        what="derivative of the eikonal loss, |g| from 0 to 1e4, in shares of 1 + |g|",
+        usual_formula="(|g| - 1)^2",
+        usual=lambda: eikonal_slope_error(plain_eikonal),
+        ours=lambda: eikonal_slope_error(losses.eikonal),
+        tolerance=1e-6,
+    ),
+    Sweep(
+        what="Taylor residual and its derivative, |g| from 0 to 1e4, in shares of 1 + |g|",
+        usual_formula="pulling by f g / |g|",
+        usual=lambda: taylor_error(pulled),
+        ours=lambda: taylor_error(losses.taylor_at_query),
+        tolerance=1e-6,
+    ),
+    Sweep(
+        what="Laplacian at every node, those of the sides too, in cells",
+        usual_formula="neighbours by flat number, six less six times the middle",
+        usual=lambda: laplacian_error(wrapping_laplacian),
+        ours=lambda: laplacian_error(our_laplacian),
+        tolerance=1e-6,
+    ),
+    Sweep(
+        what="Charbonnier loss of residuals 1e-12 to 1e4 scales, relative",
+        usual_formula="sqrt(1 + x^2) - 1",
+        usual=lambda: relative_error(lambda x: (1 + x * x).sqrt() - 1, exact_charbonnier, residuals()),
+        ours=lambda: relative_error(lambda x: losses.charbonnier(x, 1.0), exact_charbonnier, residuals()),
+        tolerance=1e-6,
+    ),
+    Sweep(
+        what="entropy of the side, logits -80 to 80, relative",
+        usual_formula="softplus(x) - x sigmoid(x)",
+        usual=lambda: relative_error(lambda x: F.softplus(x) - x * torch.sigmoid(x), exact_entropy, logits()),
+        ours=lambda: relative_error(lambda x: losses.entropy_of_side(x, 1.0), exact_entropy, logits()),
+        tolerance=1e-6,
+    ),
+    Sweep(
+        what="where rays enter the unit sphere from 2 to 1e4 away, in shares of the way",
+        usual_formula="b^2 - c, the quadratic's discriminant",
+        usual=lambda: entry_error(by_discriminant),
+        ours=lambda: entry_error(sphere_entry),
+        tolerance=1e-6,
+    ),
+)
+
+
+@pytest.mark.parametrize("sweep", SWEEPS, ids=lambda sweep: sweep.what)
+def test_sweep(sweep: Sweep) -> None:
+    check(sweep)
+
+
+@pytest.mark.parametrize("nodes", NODES)
+def test_at_a_border_the_gradient_is_that_of_a_cell_beside_it(nodes: int) -> None:
+    """It jumps there; what must not happen is a mixture of both, or a slope over less than a cell."""
+    points = border_points(nodes)
+    _, found = value_and_gradient(ball(nodes).float(), locate(points, nodes))
+    inner = points.double().clamp(-1, 1)
+    step = 1e-3 * spacing(nodes)
+    apart = [
+        (
+            found - value_and_gradient(ball(nodes), locate(inner + step * torch.tensor([x, y, z]), nodes))[1]
+        ).abs()
+        for x in (-1, 1)
+        for y in (-1, 1)
+        for z in (-1, 1)
+    ]
+    # beside the border by a thousandth of a cell the other two coordinates have moved as well
+    assert torch.stack(apart).amax(dim=-1).amin(dim=0).max() < 5e-3
+
+
+def test_a_flat_place_has_no_normal_and_no_infinite_one() -> None:
+    """As the renderer has it: g / max(|g|, 1e-3) is 0 at 0; g / |g| is not a number."""
+    g = gradients()
+    normal = F.normalize(g, dim=-1, eps=1e-3)
+    assert normal.norm(dim=-1).max() < 1 + 1e-6
+    assert gradient(lambda x: F.normalize(x, dim=-1, eps=1e-3), g).abs().max() < 2e3
+    assert not (g / g.square().sum(dim=-1, keepdim=True).sqrt()).isfinite().all()
+
+
+def test_a_field_without_slope_has_losses_that_say_so() -> None:
+    """All of a box at one distance: eikonal 1, curvature 0, and the residual is that distance."""
+    grid = torch.full((9, 9, 9), 0.25, requires_grad=True)
+    points = border_points(9)
+    value, slope = value_and_gradient(grid, locate(points, 9))
+    assert losses.eikonal(slope).item() == pytest.approx(1.0, abs=1e-5)
+    assert (our_laplacian(grid) == 0).all()
+    residual = losses.taylor_at_query(value, slope, torch.ones_like(points))
+    torch.testing.assert_close(residual, torch.full_like(residual, 0.25))
+    total = losses.eikonal(slope) + residual.square().mean() + our_laplacian(grid).square().mean()
+    (found,) = torch.autograd.grad(total, grid)
+    assert found.isfinite().all()
