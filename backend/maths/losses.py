@@ -33,9 +33,14 @@ def charbonnier(residual: Float[Tensor, "*batch"], scale: float) -> Float[Tensor
     return scale * (torch.sqrt(1 + scaled * scaled) - 1)
 
 
+def length(gradient: Float[Tensor, "points 3"]) -> Float[Tensor, "points"]:
+    """|grad f|, at least 1e-6, with finite derivative also where the gradient vanishes."""
+    return torch.sqrt((gradient * gradient).sum(dim=-1) + 1e-12)
+
+
 def eikonal(gradient: Float[Tensor, "points 3"]) -> Float[Tensor, ""]:
-    """Mean of (|grad f| - 1)^2; finite, with finite derivative, also where the gradient vanishes."""
-    return (torch.sqrt((gradient * gradient).sum(dim=-1) + 1e-12) - 1).square().mean()
+    """Mean of (|grad f| - 1)^2."""
+    return (length(gradient) - 1).square().mean()
 
 
 def silhouette(log_pass: Float[Tensor, "rays"], coverage: Float[Tensor, "rays"]) -> Float[Tensor, ""]:
