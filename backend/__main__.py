@@ -1,4 +1,4 @@
-"""The command line: python -m backend reconstruct | cameras | doctor | install | rehearse | benchmark."""
+"""The command line: python -m backend COMMAND; --help lists the commands."""
 
 import argparse
 import faulthandler
@@ -14,6 +14,7 @@ from .commands.benchmark import add_benchmark, benchmark, positive_seconds
 from .commands.doctor import doctor_on_wire
 from .commands.reconstruct import EXIT_FINE, EXIT_USER_ERROR, on_terminal, on_wire
 from .commands.rehearse import rehearse
+from .commands.render import add_render, render
 from .waiting import set_waiting_policy
 from .wire.environment import BUILDS
 from .wire.protocol import DEVICES, PRESETS, PROTOCOL_VERSION, Job
@@ -44,6 +45,8 @@ def run(arguments: list[str] | None) -> int:
         return benchmark(parsed)
     if parsed.command == "cameras":
         return _cameras(parsed)
+    if parsed.command == "render":
+        return render(parsed)
     if parsed.command == "rehearse":
         return rehearse(parsed.output, seconds=parsed.seconds, end=parsed.end)
     return _reconstruct(parser, parsed)
@@ -129,6 +132,7 @@ def _parser() -> argparse.ArgumentParser:
     _add_cameras(
         commands.add_parser("cameras", help="find where photographs were taken, and how sure that is")
     )
+    add_render(commands.add_parser("render", help="pictures of a finished job from given cameras"))
     check = commands.add_parser("doctor", help="check that everything needed is there")
     form = check.add_mutually_exclusive_group()
     form.add_argument("--json", action="store_true", help="for programs")

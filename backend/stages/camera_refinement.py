@@ -24,7 +24,7 @@ from ..maths.projection import projected
 from ..scene import Camera, Decision, Progress, Region, SolvedCameras, SurfacePoints, View, transform_points
 from .bundle_adjustment import adjust_bundle
 from .lenses import rigid_matrix
-from .stereo import StereoResult, match_views
+from .stereo import StereoResult, match_views, unmatched
 from .stereo_config import StereoConfig
 from .stereo_windows import neighbours
 
@@ -89,12 +89,20 @@ class Refined:
 
 
 def match_solved(
-    solved: SolvedCameras, region: Region, config: StereoConfig, *, device: torch.device, progress: Progress
+    solved: SolvedCameras,
+    region: Region,
+    config: StereoConfig | None,
+    *,
+    device: torch.device,
+    progress: Progress,
 ) -> StereoResult:
     """Stereo of the photographs; where their cameras were estimated and turn out to be off, once more.
 
-    Given cameras are taken at their word. Raises what `match_views` does.
+    Given cameras are taken at their word. Without a config nothing is compared: what is fitted does not ask.
+    Raises what `match_views` does.
     """
+    if config is None:
+        return unmatched(solved.views)
     work = partial(match_views, region=region, config=config, device=device)
     if not solved.estimated:
         return work(solved.views, progress=progress)
