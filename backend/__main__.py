@@ -1,4 +1,4 @@
-"""The command line: python -m backend reconstruct | doctor | install | rehearse | benchmark."""
+"""The command line: python -m backend reconstruct | fit-points | doctor | install | rehearse | benchmark."""
 
 import argparse
 import faulthandler
@@ -12,6 +12,7 @@ from . import doctor
 from .commands import install
 from .commands.benchmark import add_benchmark, benchmark, positive_seconds
 from .commands.doctor import doctor_on_wire
+from .commands.fit_points import add_fit_points, fit_points_command
 from .commands.reconstruct import EXIT_FINE, EXIT_USER_ERROR, on_terminal, on_wire
 from .commands.rehearse import rehearse
 from .waiting import set_waiting_policy
@@ -41,6 +42,8 @@ def run(arguments: list[str] | None) -> int:
         return _install(parsed)
     if parsed.command == "benchmark":
         return benchmark(parsed)
+    if parsed.command == "fit-points":
+        return fit_points_command(parsed)
     if parsed.command == "rehearse":
         return rehearse(parsed.output, seconds=parsed.seconds, end=parsed.end)
     return _reconstruct(parser, parsed)
@@ -118,6 +121,7 @@ def _parser() -> argparse.ArgumentParser:
         metavar="S",
         help="time for fitting the surface, the rest of the run not counted (what the preset needs)",
     )
+    add_fit_points(commands.add_parser("fit-points", help="make a mesh from points alone"))
     check = commands.add_parser("doctor", help="check that everything needed is there")
     form = check.add_mutually_exclusive_group()
     form.add_argument("--json", action="store_true", help="for programs")
