@@ -12,6 +12,7 @@ from . import doctor
 from .commands import install
 from .commands.benchmark import add_benchmark, benchmark, positive_seconds
 from .commands.doctor import doctor_on_wire
+from .commands.fit_points import add_fit_points, fit_points_command
 from .commands.reconstruct import EXIT_FINE, EXIT_USER_ERROR, on_terminal, on_wire
 from .commands.rehearse import rehearse
 from .commands.render import add_render, render
@@ -47,6 +48,8 @@ def run(arguments: list[str] | None) -> int:
         return _cameras(parsed)
     if parsed.command == "render":
         return render(parsed)
+    if parsed.command == "fit-points":
+        return fit_points_command(parsed)
     if parsed.command == "rehearse":
         return rehearse(parsed.output, seconds=parsed.seconds, end=parsed.end)
     return _reconstruct(parser, parsed)
@@ -133,6 +136,7 @@ def _parser() -> argparse.ArgumentParser:
         commands.add_parser("cameras", help="find where photographs were taken, and how sure that is")
     )
     add_render(commands.add_parser("render", help="pictures of a finished job from given cameras"))
+    add_fit_points(commands.add_parser("fit-points", help="make a mesh from points alone"))
     check = commands.add_parser("doctor", help="check that everything needed is there")
     form = check.add_mutually_exclusive_group()
     form.add_argument("--json", action="store_true", help="for programs")

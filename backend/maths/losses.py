@@ -5,10 +5,12 @@ SparseCraft's (Younes et al., ECCV 2024, in the scalar form of its project page)
 distance to the nearest point, are 0 wherever q lies on the measured tangent plane.
 """
 
+import math
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from torch.nn.functional import softplus
+from torch.nn.functional import normalize, softplus
 
 
 def taylor_at_query(
@@ -66,3 +68,53 @@ def entropy_of_side(distance: Float[Tensor, "points"], sharpness: float) -> Floa
     """
     logit = sharpness * distance.abs()
     return softplus(-logit) + logit * torch.sigmoid(-logit)
+
+
+def pull(
+    distance: Float[Tensor, "*batch"],
+    gradient: Float[Tensor, "*batch 3"],
+    p_minus_q: Float[Tensor, "*#batch 3"],
+) -> Float[Tensor, "*batch"]:
+    """|q - f(q) g / |g| - p|: how far from p the field moves q to reach its zero level.
+
+    Neural-Pull (Ma et al., ICML 2021, equation 2), without its square, as Ouasfi and Boukhayma have it.
+    The direction is bounded where the gradient vanishes.
+    """
+    moved = distance[..., None] * normalize(gradient, dim=-1, eps=1e-6)
+    off: Tensor = torch.linalg.vector_norm(p_minus_q + moved, dim=-1)
+    return off
+
+
+def newton_pull(
+    logit: Float[Tensor, "*batch"],
+    gradient: Float[Tensor, "*batch 3"],
+    p_minus_q: Float[Tensor, "*#batch 3"],
+    *,
+    least_slope: float,
+) -> Float[Tensor, "*batch"]:
+    """The same for a field that is no distance: q moves by a Newton step, f g / |g|^2 (SparseOcc).
+
+    A slope below `least_slope` counts as that, so that a flat field does not throw q far away.
+    """
+    slope2 = (gradient * gradient).sum(dim=-1, keepdim=True).clamp(min=least_slope**2)
+    off: Tensor = torch.linalg.vector_norm(p_minus_q + logit[..., None] * gradient / slope2, dim=-1)
+    return off
+
+
+def worst_offset(
+    loss_gradient: Float[Tensor, "*batch 3"], radius: Float[Tensor, "*batch"]
+) -> Float[Tensor, "*batch 3"]:
+    """rho g / |g|: to first order the move within a ball that raises the loss most; 0 where g is 0.
+
+    The spatial adversary of NAP (Ouasfi and Boukhayma, ICML 2024).
+    """
+    return radius[..., None] * normalize(loss_gradient, dim=-1, eps=1e-20)
+
+
+def log_mean_exp(losses: Float[Tensor, "draws *batch"], temperature: float) -> Float[Tensor, "*batch"]:
+    """T log mean exp(loss / T) over the draws: their mean for T to infinity, their maximum for T to 0.
+
+    The dual of the worst distribution within a Sinkhorn ball (SDRO, Ouasfi and Boukhayma, CVPR 2025). The
+    largest is taken out of the sum before the exponential, so that nothing overflows.
+    """
+    return temperature * (torch.logsumexp(losses / temperature, dim=0) - math.log(len(losses)))

@@ -28,7 +28,7 @@ from ..scene import Camera, SurfaceMesh
 from .calibration import Calibration, calibration
 from .raycast import RayCaster, interpolate, intersect_planes, visible_from
 
-_READ_FAILURES = (
+READ_FAILURES = (
     OSError,
     ValueError,
     LookupError,
@@ -161,7 +161,7 @@ def load_truth(path: Path) -> TrueSurface:
         geometry = loaded.to_geometry() if hasattr(loaded, "to_geometry") else loaded
         vertices = np.asarray(geometry.vertices, np.float64)
         faces = np.asarray(getattr(geometry, "faces", np.zeros((0, 3))), np.int64)
-    except _READ_FAILURES as error:
+    except READ_FAILURES as error:
         raise _unreadable(f"The true surface {path.name} can not be read ({error}).") from error
     if len(vertices) < 3 or not np.isfinite(vertices).all() or not np.ptp(vertices, axis=0).any():
         raise _unreadable(f"The true surface {path.name} holds no surface.")

@@ -232,17 +232,27 @@ def support_of(
     cell: float,
 ) -> Float32[np.ndarray, "vertices"]:
     """How well photographs back every vertex, 0 to 1 (see the module's first lines)."""
+    measured = measured_share(vertices, points, confidence, cell)
     looked_at = -np.expm1(-seen.sum(axis=1).astype(np.float64))
+    return np.asarray(0.7 * measured + 0.3 * looked_at, np.float32)
+
+
+def measured_share(
+    vertices: Vertices,
+    points: Float64[np.ndarray, "points 3"],
+    confidence: Float32[np.ndarray, "points"],
+    cell: float,
+) -> Float64[np.ndarray, "vertices"]:
+    """How well points near every vertex back it, 0 to 1: saturates with their number and confidence."""
     if not len(points):
-        return np.asarray(0.3 * looked_at, np.float32)
+        return np.zeros(len(vertices))
     # beyond, the bell is less than 1e-10; a search without a bound is slow where no point is near
     distance, nearest = cKDTree(points).query(
         vertices, k=min(8, len(points)), distance_upper_bound=7.5 * cell, workers=-1
     )
     near = np.exp(-((np.atleast_2d(distance.T).T / (1.5 * cell)) ** 2))
     near *= np.append(confidence, 0.0)[np.atleast_2d(nearest.T).T]  # the last for those that found none
-    measured = -np.expm1(-near.sum(axis=1))
-    return np.asarray(0.7 * measured + 0.3 * looked_at, np.float32)
+    return np.asarray(-np.expm1(-near.sum(axis=1)))
 
 
 def _open_or_closed(

@@ -1,0 +1,221 @@
+"""The command that makes a surface from points alone, for a terminal or for a program on the wire."""
+
+import argparse
+import json
+import logging
+import sys
+import time
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from ..errors import ErrorCode, ReconstructionError
+from ..failures import explain_or_none, internal_error
+from ..wire import protocol
+from ..wire.speaker import Speaker
+from .cancelling import CancelRequest, catch_signals, watch_signals
+from .reconstruct import EXIT_USER_ERROR, converse, say_last, settle
+
+if TYPE_CHECKING:
+    from ..maths.metrics import ErrorAgainstTruth, TrueSurface
+    from ..pipeline import Listener, Outcome
+    from ..scene import SurfaceMesh
+    from ..workspace import Workspace
+
+POINT_METHODS = ("linear", "neural-pull", "nap", "sdro", "entropy")
+"""As `stages.point_fit` and `stages.point_network` name them; here, so that --help needs no torch."""
+
+_STAGES = ("points", "surface", "mesh")
+
+logger = logging.getLogger(__name__)
+
+
+def add_fit_points(parser: argparse.ArgumentParser) -> None:
+    """The command's words."""
+    add = parser.add_argument
+    add("cloud", metavar="CLOUD", type=Path, help="PLY, or text with the columns x y z [nx ny nz]")
+    add(
+        "--output",
+        metavar="DIR",
+        type=Path,
+        required=True,
+        help="new or empty folder, or of an earlier fit",
+    )
+    add("--normals-known", action="store_true", help="the file's normals point outwards: meet them")
+    add("--method", choices=POINT_METHODS, default="linear", help="how the field is found (linear)")
+    add("--truth", metavar="MESH", type=Path, help="true mesh to measure the result against")
+    add("--device", choices=protocol.DEVICES, default="auto", help="where to compute (auto)")
+    add("--seed", type=int, metavar="N", default=0, help="of all chance (0)")
+    add("--wire", action="store_true", help="for programs: messages on stdout")
+
+
+def fit_points_command(parsed: argparse.Namespace) -> int:
+    """Fit and leave mesh.ply and report.json; the exit code."""
+    return _on_wire(parsed) if parsed.wire else _on_terminal(parsed)
+
+
+def _on_terminal(parsed: argparse.Namespace) -> int:
+    try:
+        from ..terminal import terminal_listener  # here, because rich may be missing
+    except ImportError as error:
+        known = explain_or_none(error) or internal_error(error)
+        sys.stderr.write(f"Error: {known.text}\n{known.remedy}\n")
+        return EXIT_USER_ERROR
+    request = CancelRequest()
+    with terminal_listener(request) as listener:
+        watch_signals(request, listener.stopping)
+        return settle(
+            lambda: listener.finished(parsed.output, _fit(parsed, listener)),
+            failed=listener.failed,
+            cancelled=lambda: listener.warned(_cancelled().text),
+        )
+
+
+def _on_wire(parsed: argparse.Namespace) -> int:
+    from .wire_listener import WireListener
+
+    def work(request: CancelRequest, speaking: Speaker) -> None:
+        outcome = _fit(parsed, WireListener(request, speaking))
+        say_last(speaking, protocol.Finished(output=str(parsed.output), files=outcome.files))
+
+    return converse(work, _cancelled())
+
+
+def _cancelled() -> protocol.Failed:
+    return protocol.Failed(
+        code=protocol.CANCELLED, text="The fit was stopped; nothing was written.", remedy="Start it again."
+    )
+
+
+def _fit(parsed: argparse.Namespace, listener: "Listener") -> "Outcome":
+    """Raises ReconstructionError for what the user can mend, and Cancelled; then nothing is written."""
+    from ..maths.metrics import load_truth  # torch may be missing, and --help must still work
+    from ..workspace import open_workspace
+
+    catch_signals()
+    truth = None if parsed.truth is None else load_truth(parsed.truth)
+    with open_workspace(parsed.output) as workspace:
+        try:
+            if any(workspace.private.glob("*.npz")):
+                raise ReconstructionError(
+                    ErrorCode.OUTPUT_UNUSABLE,
+                    f"{parsed.output} holds a reconstruction from photographs.",
+                    "Choose a new or empty folder for --output.",
+                )
+            return _fit_into(workspace, parsed, listener, truth)
+        finally:
+            workspace.discard_if_nothing_done()
+
+
+def _fit_into(
+    workspace: "Workspace", parsed: argparse.Namespace, listener: "Listener", truth: "TrueSurface | None"
+) -> "Outcome":
+    import torch
+
+    from ..machine import choose_device, set_up_torch
+    from ..maths.metrics import surface_error
+    from ..mesh_files import write_mesh
+    from ..pipeline import Outcome
+    from ..stages.mesh import MeshConfig
+    from ..stages.point_cloud import read_cloud
+    from ..stages.point_fit import PointFitConfig, fit_points, mesh_of_points
+
+    device = choose_device(parsed.device)
+    set_up_torch(device)
+    began_s = time.perf_counter()
+    stages = _Stages(listener)
+    stages.next()
+    cloud = read_cloud(parsed.cloud)
+    for decision in cloud.decisions:
+        listener.warned(f"{decision.what}: {decision.choice}")
+    stages.next()
+    config = PointFitConfig(method=parsed.method, normals_known=parsed.normals_known)
+    generator = torch.Generator().manual_seed(parsed.seed)
+    surface = fit_points(cloud, config, device=device, generator=generator, progress=listener.progressed)
+    stages.next()
+    mesh = mesh_of_points(surface, cloud, MeshConfig(), progress=listener.progressed)
+    seconds = time.perf_counter() - began_s
+    error = None
+    if truth is not None:
+        listener.progressed(0.9, "comparing with the truth")
+        error = surface_error(mesh, truth, cameras=None, seed=parsed.seed)
+    stages.end()
+    report = _report(parsed, len(cloud.positions), mesh, seconds, error)
+    text = json.dumps(report, indent=2) + "\n"
+    workspace.write_results(
+        {
+            "mesh.ply": partial(write_mesh, mesh=mesh),
+            "report.json": lambda path: path.write_text(text, encoding="utf-8"),
+        }
+    )
+    return Outcome(files=("mesh.ply", "report.json"), summary=_summary(report))
+
+
+class _Stages:
+    """Tells the listener of the stages, one after the other."""
+
+    def __init__(self, listener: "Listener") -> None:
+        self._listener = listener
+        self._index = 0
+        self._began_s = time.perf_counter()
+
+    def next(self) -> None:
+        """End the stage that runs and begin the next."""
+        self.end()
+        self._began_s = time.perf_counter()
+        self._listener.stage_started(_STAGES[self._index], self._index + 1, len(_STAGES))
+        self._index += 1
+
+    def end(self) -> None:
+        """End the stage that runs, if one does."""
+        from ..workspace import StageCost
+
+        if self._index:
+            seconds = time.perf_counter() - self._began_s
+            self._listener.stage_finished(StageCost(seconds=seconds, peak_memory_bytes=None))
+
+
+def _report(
+    parsed: argparse.Namespace,
+    num_points: int,
+    mesh: "SurfaceMesh",
+    seconds: float,
+    error: "ErrorAgainstTruth | None",
+) -> dict[str, object]:
+    """The numbers for report.json; the unit is the last word of a key."""
+    import trimesh
+
+    closed = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).is_watertight
+    whole = None if error is None else error.whole
+    return {
+        "method": parsed.method,
+        "normals_known": parsed.normals_known,
+        "num_points": num_points,
+        "num_faces": len(mesh.faces),
+        "watertight": bool(closed),
+        "seconds": round(seconds, 2),
+        "decisions": [{"what": d.what, "choice": d.choice, "because": d.because} for d in mesh.decisions],
+        "error": whole
+        and {
+            "accuracy_percent": whole.accuracy_percent,
+            "completeness_percent": whole.completeness_percent,
+            "chamfer_percent": whole.chamfer_percent,
+            "f_score_at_half_percent": whole.f_score_at_half_percent,
+            "f_score_at_one_percent": whole.f_score_at_one_percent,
+            "normal_consistency": whole.normal_consistency,
+        },
+    }
+
+
+def _summary(report: dict[str, object]) -> tuple[str, ...]:
+    closed = "closed" if report["watertight"] else "open"
+    lines = [
+        f"{report['num_faces']} triangles, {closed}; {report['num_points']} points; {report['seconds']} s"
+    ]
+    error = report["error"]
+    if isinstance(error, dict):
+        lines.append(
+            f"Error against the truth: Chamfer {error['chamfer_percent']:.3f} % of the diagonal, "
+            f"F-score at 1 %: {error['f_score_at_one_percent']:.3f}"
+        )
+    return tuple(lines)

@@ -1,0 +1,48 @@
+"""What the neighbours of a point in a cloud say of it: their plane, and whether it belongs to them."""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float64
+from scipy.spatial import cKDTree
+
+
+class Planes(NamedTuple):
+    """The least-squares plane of each point's neighbours."""
+
+    normals: Float64[np.ndarray, "points 3"]
+    """Unit; which of the two sides is chance."""
+    flatness: Float64[np.ndarray, "points"]
+    """1 - the smallest over the middle variance: 1 on a plane, 0 where no direction is thinnest."""
+
+
+def neighbour_planes(points: Float64[np.ndarray, "points 3"], count: int = 20) -> Planes:
+    """From the principal axes of `count` neighbours, the point included (Hoppe et al., SIGGRAPH 1992)."""
+    _, index = cKDTree(points).query(points, k=min(count, len(points)), workers=-1)
+    around = points[index]
+    around -= around.mean(axis=1, keepdims=True)
+    variance, axes = np.linalg.eigh(np.einsum("pki,pkj->pij", around, around))
+    middle = variance[:, 1]
+    flatness = 1 - np.clip(variance[:, 0], 0, None) / np.where(middle > 0, middle, 1.0)
+    return Planes(normals=axes[:, :, 0], flatness=np.where(middle > 0, flatness, 0.0))
+
+
+def crowding(points: Float64[np.ndarray, "points 3"], count: int = 12) -> Float64[np.ndarray, "points"]:
+    """How much a point is to be trusted, 0 to 1: 1 where neighbours are near, less the lonelier it is.
+
+    The area that `count` neighbours take is held against that of the cloud's denser quarter: four times
+    that is a half. Up to half of the cloud may be strays that lie in the open.
+    """
+    count = min(count, len(points) - 1)
+    reach, _ = cKDTree(points).query(points, k=[count + 1], workers=-1)
+    area = reach[:, 0] ** 2
+    usual = np.quantile(area, 0.25)
+    return np.asarray(1 / (1 + (area / (4 * max(usual, np.finfo(float).tiny))) ** 2))
+
+
+def against_neighbours(
+    points: Float64[np.ndarray, "points 3"], normals: Float64[np.ndarray, "points 3"], count: int = 8
+) -> Bool[np.ndarray, "points"]:
+    """True where a normal points away from the mean of its neighbours' normals."""
+    _, index = cKDTree(points).query(points, k=min(count, len(points)), workers=-1)
+    return np.asarray((normals[index[:, 1:]].sum(axis=1) * normals).sum(axis=1) < 0)
