@@ -85,13 +85,13 @@ def test_no_seed_leads_to_what_is_not_a_number() -> None:
 
 
 def test_a_few_pixels_that_are_no_numbers_cost_a_few_steps() -> None:
-    one_pixel = spoiled(slice(24, 25), slice(32, 33))
+    one_pixel = spoiled(slice(20, 21), slice(30, 31))
     with_it, without = rendered(one_pixel, 40), rendered(scene().views, 40)
     assert with_it.steps == 40
     assert 0 < with_it.taken_back < PATIENCE
     assert with_it.distance.isfinite().all()
     apart = float((with_it.distance - without.distance).abs().max())
-    assert apart < moved(without), "it keeps most of what is learnt"
+    assert apart < 0.5 * moved(without), "what was learnt ten steps before is kept"
     because = told(fitted(one_pixel, 40)).because
     assert because.startswith(f"the preset; {with_it.taken_back} steps led to numbers that are not finite")
 
