@@ -23,9 +23,17 @@ def sphere_entry(
     origins: Float[Tensor, "rays 3"], directions: Float[Tensor, "rays 3"]
 ) -> Float[Tensor, "rays"]:
     """Where rays enter the unit sphere; 0 if they start inside; the nearest point if they miss it."""
+    return sphere_span(origins, directions)[0]
+
+
+def sphere_span(
+    origins: Float[Tensor, "rays 3"], directions: Float[Tensor, "rays 3"]
+) -> tuple[Float[Tensor, "rays"], Float[Tensor, "rays"]]:
+    """Where rays enter and leave the unit sphere, as `sphere_entry`; the same place twice if they miss it."""
     middle = -(origins * directions).sum(dim=-1)
     half_squared = 1 - (origins + middle[:, None] * directions).square().sum(dim=-1)
-    return (middle - half_squared.clamp(min=0).sqrt()).clamp(min=0)
+    half = half_squared.clamp(min=0).sqrt()
+    return (middle - half).clamp(min=0), (middle + half).clamp(min=0)
 
 
 def first_crossing(

@@ -4,16 +4,14 @@ Rays are searched in the field itself, so that samples lie on the surface's two 
 costs nothing.
 """
 
-import math
 from dataclasses import dataclass
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
 from ..maths import losses
-from ..maths.geometry import ray_directions
 from ..maths.grid import laplacian_at, read, spacing, splat
 from ..maths.rays import first_crossing, sphere_entry
 from ..maths.volume import blending_weights, log_transmittance, log_transparency
@@ -21,6 +19,7 @@ from ..scene import Progress
 from .deadline import Deadline
 from .field import SurfaceField
 from .measurements import Measurements
+from .pixels import Pixels, rays_through, worthy_pixels
 from .safe_steps import SafeSteps
 
 
@@ -45,48 +44,6 @@ class Refined:
     """How many of those tried had a loss or a gradient that is not finite."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Pixels:
-    """Every pixel worth a ray, of all views."""
-
-    view: Int[Tensor, "pixels"]
-    where: Float[Tensor, "pixels 2"]
-    colour: Float[Tensor, "pixels 3"]
-    coverage: Float[Tensor, "pixels"]
-    """The mask's value, or nan where there is no mask."""
-
-
-def _worthy_pixels(scene: Measurements) -> _Pixels:
-    """On and just around the subject: where the mask is, or where something was measured."""
-    parts = []
-    for index, (image, mask, outline, depth) in enumerate(
-        zip(scene.images, scene.masks, scene.outlines, scene.depths, strict=True)
-    ):
-        near = outline < 8 if outline is not None else F.max_pool2d((depth > 0).float()[None], 5, 1, 2)[0] > 0
-        rows, columns = torch.nonzero(near, as_tuple=True)
-        coverage = (
-            mask[rows, columns] if mask is not None else torch.full_like(rows, math.nan, dtype=torch.float32)
-        )
-        where = torch.stack([columns, rows], dim=-1) + 0.5
-        parts.append((torch.full_like(rows, index), where, image[:, rows, columns].T, coverage))
-    view, where, colour, coverage = (torch.cat(column) for column in zip(*parts, strict=True))
-    return _Pixels(view=view, where=where, colour=colour, coverage=coverage)
-
-
-def _rays(
-    scene: Measurements, pixels: _Pixels, chosen: Int[Tensor, "rays"]
-) -> tuple[Float[Tensor, "rays 3"], Float[Tensor, "rays 3"]]:
-    """Origins and unit directions of chosen pixels."""
-    origins = pixels.where.new_empty((len(chosen), 3))
-    directions = torch.empty_like(origins)
-    view = pixels.view[chosen]
-    for index, camera in enumerate(scene.cameras):
-        mine = view == index
-        origins[mine] = camera.position
-        directions[mine] = F.normalize(ray_directions(camera, pixels.where[chosen[mine]]), dim=-1)
-    return origins, directions
-
-
 def refine(
     scene: Measurements,
     distance: Float[Tensor, "nodes nodes nodes"],
@@ -103,7 +60,7 @@ def refine(
     """
     field = SurfaceField(distance, band_cells=4, channels=6, view_dependent=False, generator=generator)
     _colour_from_points(field, scene)
-    pixels = _worthy_pixels(scene)
+    pixels = worthy_pixels(scene)
     h = spacing(field.nodes)
     optimiser = torch.optim.Adam(
         [
@@ -149,14 +106,14 @@ def _ray_loss(
     field: SurfaceField,
     whole: Float[Tensor, "nodes nodes nodes"],
     scene: Measurements,
-    pixels: _Pixels,
+    pixels: Pixels,
     sharpness: float,
     config: RenderConfig,
     generator: torch.Generator,
 ) -> Float[Tensor, ""]:
     """Difference between rendered and photographed colours, and between opacity and masks."""
     chosen = torch.randint(len(pixels.view), (config.rays,), generator=generator).to(pixels.view.device)
-    origins, directions = _rays(scene, pixels, chosen)
+    origins, directions = rays_through(scene.cameras, pixels, chosen)
     with torch.no_grad():
         entry = sphere_entry(origins, directions)
         crossing = first_crossing(lambda x: read(whole, x), origins, directions, entry)

@@ -20,6 +20,7 @@ from ..scene import Decision, Progress, Region, View, to_unit_sphere, within
 from .deadline import Clock, GridCost, deadline_after, finest_grid, predicted_s
 from .linear_fit import LinearConfig, fit_level, start
 from .measurements import Measurements, measurements
+from .radiance_field import Radiance
 from .render_fit import RenderConfig, refine
 from .silhouettes import least_distance, missing, silhouette_rays
 from .stereo import StereoResult
@@ -58,6 +59,8 @@ class Surface:
     """Signed, on nodes over the cube [-1, 1]^3 of the grid frame and in its units; > 0 outside."""
     grid_from_world: Float64[np.ndarray, "4 4"]
     """A similarity: the cube is laid tightly around the surface."""
+    radiance: Radiance | None = None
+    """The field to render from, where one was fitted."""
     decisions: tuple[Decision, ...] = ()
 
 
@@ -93,7 +96,7 @@ def fit_surface(
         radius = _radius_behind(scene, config.linear)
         began_s = clock()
         distance = fit_level(scene, start(scene, radius, COARSEST), radius, config.rounds[0], config.linear)
-        frame = _tight_frame(distance, region)
+        frame = tight_frame(distance, region)
         costs = [GridCost(nodes=COARSEST, seconds=clock() - began_s)]
         scene = measurements(views, region, frame, stereo, device)
         distance = start(scene, radius, config.levels[0])
@@ -216,12 +219,13 @@ def _why_so_deep(scene: Measurements, radius: float) -> str:
     return taken if angle_deg > 90 else f"{taken}; so turn the normals of the measured points"
 
 
-def _tight_frame(distance: Float[Tensor, "nodes nodes nodes"], region: Region) -> Region:
+def tight_frame(distance: Float[Tensor, "nodes nodes nodes"], region: Region) -> Region:
     """The cube around the inside of a coarse field, as the unit cube of a frame of its own.
 
     Raises ReconstructionError(NO_SURFACE) if there is no inside.
     """
-    inside = torch.nonzero(distance < 0).float() * spacing(COARSEST) - 1
+    cell = spacing(len(distance))
+    inside = torch.nonzero(distance < 0).float() * cell - 1
     if not len(inside):
         raise ReconstructionError(
             ErrorCode.NO_SURFACE,
@@ -229,7 +233,7 @@ def _tight_frame(distance: Float[Tensor, "nodes nodes nodes"], region: Region) -
             "Check that the photographs show the same thing, and that masks, if any, are white on it.",
         )
     low, high = inside.amin(dim=0), inside.amax(dim=0)
-    half = float((high - low).max()) / 2 + 2.5 * spacing(COARSEST)
+    half = float((high - low).max()) / 2 + 2.5 * cell
     centre = ((low + high) / 2).cpu().double().numpy()
     frame_from_object = to_unit_sphere(centre, half)
     return Region(object_from_world=frame_from_object @ region.object_from_world)
