@@ -38,12 +38,21 @@ def node_positions(nodes: int, device: torch.device) -> Float[Tensor, "nodes nod
     return torch.stack(torch.meshgrid(steps, steps, steps, indexing="ij"), dim=-1)
 
 
-def locate(points: Float[Tensor, "points 3"], nodes: int) -> Corners:
-    """The cell of each point; points outside the cube are moved to its side."""
+def cells_of(
+    points: Float[Tensor, "points 3"], nodes: int
+) -> tuple[Int[Tensor, "points 3"], Float[Tensor, "points 3"]]:
+    """Lowest node of each point's cell, and where in the cell it lies, 0 to 1 along each axis.
+
+    Points outside the cube are moved to its side. The second is differentiable in the points.
+    """
     scaled = ((points + 1) * (0.5 * (nodes - 1))).clamp(0, nodes - 1)
     low = scaled.floor().clamp(max=nodes - 2)  # the last node belongs to the last cell
-    t = scaled - low
-    base = low.long()
+    return low.long(), scaled - low
+
+
+def locate(points: Float[Tensor, "points 3"], nodes: int) -> Corners:
+    """The cell of each point; points outside the cube are moved to its side."""
+    base, t = cells_of(points, nodes)
     flat = (base[:, 0] * nodes + base[:, 1]) * nodes + base[:, 2]
     offsets = torch.tensor(
         [(i * nodes + j) * nodes + k for i in (0, 1) for j in (0, 1) for k in (0, 1)], device=points.device

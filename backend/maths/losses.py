@@ -36,10 +36,15 @@ def charbonnier(residual: Float[Tensor, "*batch"], scale: float) -> Float[Tensor
     return residual * scaled / (torch.sqrt(1 + scaled * scaled) + 1)
 
 
+def length(gradient: Float[Tensor, "points 3"]) -> Float[Tensor, "points"]:
+    """|grad f|; where the gradient vanishes, the derivative is taken to be 0."""
+    norm: Tensor = torch.linalg.vector_norm(gradient, dim=-1)
+    return norm
+
+
 def eikonal(gradient: Float[Tensor, "points 3"]) -> Float[Tensor, ""]:
-    """Mean of (|grad f| - 1)^2; where the gradient vanishes, its derivative is taken to be 0."""
-    length: Tensor = torch.linalg.vector_norm(gradient, dim=-1)
-    return (length - 1).square().mean()
+    """Mean of (|grad f| - 1)^2."""
+    return (length(gradient) - 1).square().mean()
 
 
 def silhouette(log_pass: Float[Tensor, "rays"], coverage: Float[Tensor, "rays"]) -> Float[Tensor, ""]:

@@ -14,7 +14,7 @@ from torch.nn.functional import logsigmoid, pad
 
 
 def log_transmittance(
-    distance: Float[Tensor, "rays edges"], sharpness: float
+    distance: Float[Tensor, "rays edges"], sharpness: float | Float[Tensor, ""]
 ) -> Float[Tensor, "rays intervals"]:
     """Log of the share of light that passes each interval; 0 where the ray moves away from the surface.
 
@@ -23,6 +23,30 @@ def log_transmittance(
     """
     log_phi = logsigmoid(sharpness * distance)
     return (log_phi[:, 1:] - log_phi[:, :-1]).clamp(max=0.0)
+
+
+def log_transmittance_of_middles(
+    distance: Float[Tensor, "rays intervals"],
+    slope: Float[Tensor, "rays intervals"],
+    edges: Float[Tensor, "rays edges"],
+    sharpness: float | Float[Tensor, ""],
+) -> Float[Tensor, "rays intervals"]:
+    """The same from the distance and its slope along the ray in the middle of each interval, as NeuS does it.
+
+    The distance at an interval's two ends is continued from its middle: neighbours need not agree there.
+    """
+    rise = 0.5 * slope * edges.diff(dim=-1)
+    before, after = logsigmoid(sharpness * (distance - rise)), logsigmoid(sharpness * (distance + rise))
+    return (after - before).clamp(max=0.0)
+
+
+def annealed_slope(slope: Float[Tensor, "rays intervals"], done: float) -> Float[Tensor, "rays intervals"]:
+    """Slope of the distance along the ray for `log_transmittance_of_middles`, never above 0.
+
+    Of the published program: at the start (`done` = 0) a surface that is seen from behind absorbs as well,
+    half as steeply, and gets gradients; at the end (1) only what the ray enters does.
+    """
+    return -((0.5 - 0.5 * slope).clamp(min=0) * (1 - done) + (-slope).clamp(min=0) * done)
 
 
 def blending_weights(log_pass: Float[Tensor, "rays intervals"]) -> Float[Tensor, "rays intervals"]:

@@ -6,7 +6,13 @@ import pytest
 import torch
 from torch import Tensor
 
-from backend.maths.volume import blending_weights, log_transmittance, log_transparency
+from backend.maths.volume import (
+    annealed_slope,
+    blending_weights,
+    log_transmittance,
+    log_transmittance_of_middles,
+    log_transparency,
+)
 
 
 def weights_one_by_one(distance: Tensor, sharpness: float) -> Tensor:
@@ -110,3 +116,46 @@ def test_values_and_gradients_stay_finite_far_inside_and_far_outside(distance: t
 def test_gradients_agree_with_finite_differences() -> None:
     distance = torch.linspace(0.5, -0.5, 7, dtype=torch.float64)[None].requires_grad_()
     assert torch.autograd.gradcheck(lambda f: blending_weights(log_transmittance(f, 3.0)), distance)
+
+
+def test_from_the_middles_of_a_plane_it_is_the_same() -> None:
+    """There a distance continued by its slope is the distance at the ends."""
+    edges = torch.rand(20, 9, generator=torch.Generator().manual_seed(2), dtype=torch.float64).cumsum(dim=-1)
+    slope = torch.linspace(-1, 1, 20, dtype=torch.float64)[:, None]
+    middles = slope * (edges[:, 1:] + edges[:, :-1]) / 2 - 0.5
+    found = log_transmittance_of_middles(middles, slope.expand(20, 8), edges, 30.0)
+    torch.testing.assert_close(found, log_transmittance(slope * edges - 0.5, 30.0))
+
+
+@pytest.mark.parametrize("sharpness", [1.0, 64.0, 2048.0])
+def test_from_middles_it_is_the_published_opacity_without_its_epsilon(sharpness: float) -> None:
+    """(p - n + 1e-5) / (p + 1e-5) in float64, the 1e-5 left out, where neither is 0."""
+    distance = torch.linspace(-0.25, 0.25, 101)[None]
+    slope, edges = torch.full_like(distance, -0.7), 0.01 * torch.arange(102.0)[None]
+    exact = distance.double()
+    before, after = (torch.sigmoid(sharpness * (exact + side * 0.35 * 0.01)) for side in (1, -1))
+    opacity = -torch.expm1(log_transmittance_of_middles(distance, slope, edges, sharpness))
+    torch.testing.assert_close(opacity.double(), (before - after) / before, rtol=1e-4, atol=1e-6)
+
+
+def test_the_sharpness_can_be_learned() -> None:
+    """Also where the surface is far, at both ends of what is learned."""
+    along = torch.linspace(-1.5, 1.5, 31, dtype=torch.float64)[None]
+    edges = torch.linspace(0, 3.1, 32, dtype=torch.float64)[None]
+    slope = torch.full_like(along, -1.0)
+
+    def weights(log_sharpness: Tensor) -> Tensor:
+        log_pass = log_transmittance_of_middles(along, slope, edges, log_sharpness.exp())
+        return blending_weights(log_pass)
+
+    for sharpness in (10.0, 2048.0):
+        log_sharpness = torch.tensor(sharpness, dtype=torch.float64).log().requires_grad_()
+        assert torch.autograd.gradcheck(weights, log_sharpness)
+
+
+def test_slopes_are_annealed_from_all_sides_to_the_near_one() -> None:
+    slope = torch.tensor([[-1.0, -0.5, 0.0, 0.5, 1.0]])
+    torch.testing.assert_close(annealed_slope(slope, 0.0), torch.tensor([[-1.0, -0.75, -0.5, -0.25, 0.0]]))
+    torch.testing.assert_close(annealed_slope(slope, 1.0), torch.tensor([[-1.0, -0.5, 0.0, 0.0, 0.0]]))
+    between = (annealed_slope(slope, 0.0) + annealed_slope(slope, 1.0)) / 2
+    torch.testing.assert_close(annealed_slope(slope, 0.5), between)

@@ -1,0 +1,244 @@
+"""NeuS and SparseCraft on a small scene: from a ball to the body, repeatably, and never into nothing."""
+
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cache, partial
+from itertools import count
+
+import numpy as np
+import pytest
+import torch
+
+from backend.errors import Cancelled, ErrorCode, ReconstructionError
+from backend.scene import Decision, Progress, SurfacePoints, View, no_progress, transform_points
+from backend.stages.mesh import level_set
+from backend.stages.networks import HashConfig, NetworkConfig
+from backend.stages.neus_fit import NeusConfig, active_levels, finest_detail, fit_neus, rate_share
+from backend.stages.neus_losses import Sampling, Weights
+from backend.stages.stereo import DepthMap, StereoResult
+from backend.stages.train import ShowSurface, Surface, show_nothing
+from tests.synthetic_scene import (
+    CENTRE,
+    Scene,
+    diagonal,
+    photographed,
+    ring_cameras,
+    surface_distance,
+    texture_srgb,
+    true_mesh,
+    true_normals,
+    true_region,
+)
+
+SAMPLING = Sampling(rays=96, uniform=12, rounds=2, per_round=6, point_queries=256)
+NEUS = NeusConfig(steps=200, sampling=SAMPLING, network=NetworkConfig(width=48, layers=2), nodes=40)
+SPARSECRAFT = NeusConfig(
+    steps=60,
+    sampling=replace(SAMPLING, rays=48),
+    network=NetworkConfig(
+        width=32, layers=1, hash_grid=HashConfig(levels=4, finest=32), albedo_and_specular=True
+    ),
+    weights=Weights(points=1.0),
+    learning_rate=1e-2,
+    constant=0.5,
+    slope_annealed_at=1.0,
+    nodes=40,
+)
+BOTH = [pytest.param(NEUS, id="neus"), pytest.param(SPARSECRAFT, id="sparsecraft")]
+
+
+@cache
+def scene() -> Scene:
+    return photographed(ring_cameras(6, 80))
+
+
+@cache
+def exact_stereo() -> StereoResult:
+    """Points on the true surface, without depth maps."""
+    world = np.asarray(true_mesh().vertices)[::20]
+    shape = scene().coverage[0].shape
+    blank = np.zeros(shape, np.float32)
+    points = SurfacePoints(
+        positions=transform_points(true_region().object_from_world, world).astype(np.float32),
+        normals=true_normals(world).astype(np.float32),
+        colours_srgb=texture_srgb(world).astype(np.float32),
+        confidence=np.ones(len(world), np.float32),
+        num_views=np.full(len(world), 2),
+        view_index=np.zeros(len(world), np.int64),
+    )
+    maps = (DepthMap(depth=blank, confidence=blank, empty=None, subject=None),) * len(scene().views)
+    return StereoResult(points=points, depth_maps=maps)
+
+
+def fitted(
+    config: NeusConfig,
+    *,
+    views: tuple[View, ...] | None = None,
+    seed: int = 0,
+    progress: Progress = no_progress,
+    show: ShowSurface = show_nothing,
+    clock: Callable[[], float] = time.perf_counter,
+) -> Surface:
+    torch.use_deterministic_algorithms(True)
+    try:
+        return fit_neus(
+            scene().views if views is None else views,
+            true_region(),
+            exact_stereo(),
+            config,
+            device=torch.device("cpu"),
+            generator=torch.Generator().manual_seed(seed),
+            progress=progress,
+            show=show,
+            clock=clock,
+        )
+    finally:
+        torch.use_deterministic_algorithms(False)
+
+
+def median_error_percent(surface: Surface) -> float:
+    """Of the zero level from the body, in percent of the body's diagonal."""
+    return float(np.median(100 * np.abs(surface_distance(level_set(surface)[0])) / diagonal()))
+
+
+@cache
+def ball_error_percent() -> float:
+    """Of the best that no learning could give: the ball around the centre with the least median error."""
+    directions = np.asarray(true_mesh().vertices) - CENTRE
+    reach = np.linalg.norm(directions, axis=1)
+    directions /= reach[:, None]
+    radii = np.linspace(reach.min(), reach.max(), 30)
+    errors = (np.median(np.abs(surface_distance(CENTRE + radius * directions))) for radius in radii)
+    return 100 * min(errors) / diagonal()
+
+
+@cache
+def whole(sparsecraft: bool) -> Surface:
+    return fitted(SPARSECRAFT if sparsecraft else NEUS)
+
+
+def decision_on(surface: Surface, what: str) -> Decision:
+    (found,) = (decision for decision in surface.decisions if decision.what == what)
+    return found
+
+
+def test_what_is_fitted_starts_as_a_ball() -> None:
+    assert median_error_percent(fitted(replace(NEUS, steps=1, learning_rate=0.0))) > ball_error_percent()
+
+
+@pytest.mark.parametrize(("sparsecraft", "share"), [(False, 0.5), (True, 0.1)])
+def test_the_ball_becomes_the_body(sparsecraft: bool, share: float) -> None:
+    """Rendering alone halves the error of the best ball in a few seconds; with points a tenth is left."""
+    assert median_error_percent(whole(sparsecraft)) < share * ball_error_percent()
+
+
+def test_surfaces_fit_their_grids() -> None:
+    """The cube is laid around the body: an eighth of its side to spare at most, and nothing cut off."""
+    distance = whole(True).distance
+    assert distance.shape == (40, 40, 40)
+    inside = np.argwhere(distance < 0)
+    assert inside.min() > 0
+    assert inside.max() < 39
+    assert (np.ptp(inside, axis=0).max() + 1) / 40 > 0.75
+
+
+@pytest.mark.parametrize("config", BOTH)
+def test_the_same_seed_gives_the_same_bytes(config: NeusConfig) -> None:
+    few = replace(config, steps=4, nodes=24)
+    first, again, other = fitted(few), fitted(few), fitted(few, seed=1)
+    assert first.distance.tobytes() == again.distance.tobytes()
+    assert first.distance.tobytes() != other.distance.tobytes()
+
+
+@pytest.mark.parametrize("config", BOTH)
+def test_steps_that_are_not_finite_are_not_taken(config: NeusConfig) -> None:
+    """One NaN in a photograph: the steps that hit it are counted, the others go on."""
+    views = list(scene().views)
+    image = views[0].image_srgb.copy()
+    image[20:40, 30:50] = np.nan
+    views[0] = replace(views[0], image_srgb=image)
+    surface = fitted(replace(config, steps=12, nodes=24), views=tuple(views))
+    assert np.isfinite(surface.distance).all()
+    choice = decision_on(surface, "refinement by rendering").choice
+    taken, skipped = (int(part.split()[0]) for part in choice.split(", "))
+    assert taken + skipped == 12
+    assert skipped > 0
+
+
+def test_nothing_but_nan_is_told() -> None:
+    views = tuple(replace(view, image_srgb=view.image_srgb * np.nan) for view in scene().views)
+    with pytest.raises(ReconstructionError) as raised:
+        fitted(replace(NEUS, steps=4), views=views)
+    assert raised.value.code is ErrorCode.NO_SURFACE
+
+
+def test_without_masks_a_background_colour_is_learned() -> None:
+    """Before black, with nothing cut out."""
+    surface = fitted(SPARSECRAFT, views=scene().without_masks().views)
+    assert decision_on(surface, "silhouettes").choice == "left out"
+    assert median_error_percent(surface) < 0.2 * ball_error_percent()
+
+
+def test_progress_grows_and_may_cancel() -> None:
+    told: list[float] = []
+
+    def listen(fraction: float, _text: str) -> None:
+        told.append(fraction)
+        if len(told) == 4:
+            raise Cancelled
+
+    with pytest.raises(Cancelled):
+        fitted(replace(NEUS, steps=50), progress=listen)
+    assert told == sorted(told)
+    assert 0 <= told[0] < told[-1] < 1
+
+
+def test_unfinished_surfaces_are_shown_and_change_nothing() -> None:
+    few = replace(SPARSECRAFT, steps=20, nodes=24)
+    shown: list[Surface] = []
+    surface = fitted(few, show=shown.append)
+    assert len(shown) == 10
+    assert shown[0].distance.min() < 0 < shown[0].distance.max()
+    assert surface.distance.tobytes() == fitted(few).distance.tobytes()
+
+
+def ticking(tick_s: float) -> Callable[[], float]:
+    """A clock that is later each time that it is read."""
+    return partial(next, count(0.0, tick_s))
+
+
+def test_learning_stops_at_the_deadline() -> None:
+    """Of 20 s sampling the grid is taken to cost some; each step is a reading of the clock."""
+    surface = fitted(replace(NEUS, steps=50, nodes=48, budget_s=20.0), clock=ticking(1.0))
+    choice = decision_on(surface, "budget").choice
+    steps = int(choice.removeprefix("stopped after ").removesuffix(" of 50 steps"))
+    assert 5 < steps < 20
+
+
+def test_time_enough_changes_nothing_but_the_words() -> None:
+    few = replace(NEUS, steps=5, nodes=24)
+    unlimited, ample = fitted(few, clock=ticking(1e3)), fitted(replace(few, budget_s=1e6), clock=ticking(1.0))
+    assert ample.distance.tobytes() == unlimited.distance.tobytes()
+    assert ample.decisions[:-1] == unlimited.decisions
+    assert decision_on(ample, "budget").choice == "all that the preset asks for"
+
+
+def test_levels_join_one_by_one_and_differences_shrink_with_them() -> None:
+    """As published: all 32 levels from step 3100 of 4000, a first difference of half the region's radius."""
+    published = NetworkConfig(hash_grid=HashConfig(levels=32, finest=2048))
+    levels = [active_levels(published, step / 4000) for step in range(0, 4000, 50)]
+    assert levels == sorted(levels)
+    assert set(levels) == set(range(1, 33))
+    assert active_levels(published, 3120 / 4000) == 32
+    assert finest_detail(published, 1) == 0.5
+    assert finest_detail(published, 32) == pytest.approx(2 / 2048)
+    assert active_levels(NetworkConfig(), 0.5) == 0
+
+
+def test_steps_grow_stay_and_shrink() -> None:
+    shares = [rate_share(SPARSECRAFT, done) for done in np.linspace(0, 1, 200)]
+    assert shares[0] == pytest.approx(0.01)
+    assert shares[50] == shares[99] == 1.0
+    assert shares[99:] == sorted(shares[99:], reverse=True)
+    assert shares[-1] == pytest.approx(0.05)
