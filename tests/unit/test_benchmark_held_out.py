@@ -91,7 +91,7 @@ def test_the_views_are_those_that_are_held_out(tmp_path: Path) -> None:
 
 
 def test_a_radiance_field_is_measured_by_its_own_pictures() -> None:
-    """Opaque and black in the unit sphere: of a photograph of brightness 0.1, 20 dB; covered as the ball is."""
+    """Opaque and black in the unit sphere: 20 dB from a photograph of brightness 0.1."""
     field = RadianceField(RadianceShape(width=8, layers=1), torch.Generator().manual_seed(0))
     with torch.no_grad():
         field.density_head[0].bias.fill_(100.0)
