@@ -23,6 +23,7 @@ from .field_surface import field_surface
 from .measurements import Measurements, measurements
 from .pixels import Pixels, pixels_of_unit_sphere, rays_through
 from .radiance_field import RadianceField, RadianceShape, RaySamples, kept, sample_rays
+from .safe_steps import SafeSteps
 from .stereo import StereoResult
 from .train import COARSEST, ShowSurface, Surface, show_nothing
 
@@ -66,7 +67,8 @@ def fit_radiance(
 ) -> Surface:
     """The density's level as a surface, with the field itself to render from.
 
-    Stereo is not looked at. Raises ReconstructionError(NO_SURFACE) where the field is empty.
+    Stereo is not looked at. Raises ReconstructionError(NO_SURFACE) where the field is empty, or where steps
+    led to numbers that are not finite again and again.
     """
     deadline = deadline_after(config.budget_s, clock)
     scene = measurements(views, region, region, stereo, device)
@@ -82,20 +84,22 @@ def fit_radiance(
     began_s = clock()
     steps_end = replace(deadline, at_s=deadline.at_s - min(grid_s, deadline.left_s() / 2))
     step, done = 0, 0.0
-    rate = torch.optim.lr_scheduler.LambdaLR(
-        optimiser, lambda _: min(1.0, (step + 1) / _WARM_UP_STEPS) * (_LAST_RATE / _FIRST_RATE) ** done
-    )
+    safe = SafeSteps(optimiser)
     while done < 1:
         if step % 10 == 0:
             progress(0.95 * done, f"fitting a radiance field, step {step} of {config.steps}")
+            safe.keep()
         field.open_waves(done / _ALL_WAVES_AT)
         loss = _loss(field, backdrop, scene, pixels, config.rays, generator)
-        optimiser.zero_grad(set_to_none=True)
-        torch.autograd.backward(loss)
-        optimiser.step()
+        safe.take(loss, min(1.0, (step + 1) / _WARM_UP_STEPS) * (_LAST_RATE / _FIRST_RATE) ** done)
+        if safe.hopeless:
+            raise ReconstructionError(
+                ErrorCode.NO_SURFACE,
+                f"Nothing could be learned from the photographs: {safe.taken_back} steps were not finite.",
+                "Check that the photographs open in a viewer, or use another preset.",
+            )
         step += 1
         done = max(step / config.steps, steps_end.share_gone(began_s))
-        rate.step()
     field.open_waves(1.0)
     progress(0.95, "density on a grid")
     level = _level(field, scene, pixels)
@@ -105,7 +109,7 @@ def fit_radiance(
         distance=surface.distance,
         grid_from_world=surface.grid_from_world,
         radiance=kept(field, region, backdrop.learned_srgb()),
-        decisions=_decisions(config, backdrop, step, level),
+        decisions=_decisions(config, backdrop, step, safe.taken_back, level),
     )
 
 
@@ -193,14 +197,17 @@ def _level_surface(
     return field_surface(pseudo_distance, region, nodes, device)
 
 
-def _decisions(config: RadianceConfig, backdrop: _Backdrop, steps: int, level: float) -> tuple[Decision, ...]:
+def _decisions(
+    config: RadianceConfig, backdrop: _Backdrop, steps: int, taken_back: int, level: float
+) -> tuple[Decision, ...]:
+    not_finite = f", {taken_back} of which were not finite and were taken back" if taken_back else ""
     masked, views = backdrop.num_masked, backdrop.num_views
     colour = backdrop.learned_srgb()
     learned = "" if colour is None else " ".join(f"{round(255 * float(part))}" for part in colour)
     return (
         Decision(
             what="field",
-            choice=f"density and radiance, {steps} of {config.steps} steps of {config.rays} rays",
+            choice=f"density and radiance, {steps} of {config.steps} steps of {config.rays} rays{not_finite}",
             because="the preset asks for it" if config.budget_s is None else f"{config.budget_s:g} s given",
         ),
         Decision(

@@ -1,6 +1,7 @@
 """Distances on a grid where it is delicate: at borders of cells and of the box, and without a gradient."""
 
 from collections.abc import Callable
+from functools import cache
 
 import pytest
 import torch
@@ -24,6 +25,7 @@ CPU = torch.device("cpu")
 NODES = (2, 3, 47, 96, 192)
 
 
+@cache
 def ball(nodes: int) -> Tensor:
     """Distances to a ball, in float64."""
     return node_positions(nodes, CPU).double().norm(dim=-1) - 0.6

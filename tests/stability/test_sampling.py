@@ -9,6 +9,7 @@ from torch import Tensor
 
 from backend.maths.encoding import positional_encoding
 from backend.maths.geometry import sample_image
+from backend.maths.radiance import proposal_loss
 from backend.maths.resampling import resample, strata
 from tests.stability.sweep import Sweep, check, gradient, largest
 
@@ -116,6 +117,29 @@ def wave_slope_error(waves: Callable[[Tensor], Tensor]) -> float:
     return largest(found, exact, math.pi * 2.0 ** (FREQUENCIES - 1))
 
 
+# the proposal
+
+
+def histograms() -> tuple[Tensor, Tensor]:
+    """Weights from 0 over denormal ones to 1, and bounds from 0 to twice as large."""
+    weights = torch.cat([torch.zeros(1), 10.0 ** torch.arange(-44, 1)])[:, None].expand(-1, 9)
+    return weights, weights * torch.linspace(0, 2, 9)
+
+
+def with_epsilon(weights: Tensor, bound: Tensor) -> Tensor:
+    """mip-NeRF 360's published program."""
+    return ((weights - bound).clamp(min=0).square() / (weights + 1e-7)).sum(dim=-1).mean()
+
+
+def proposal_slope_error(loss: Callable[[Tensor, Tensor], Tensor]) -> float:
+    """Of the derivative by the bound, -2 (1 - bound / w) where that is too small; finite for any weight."""
+    weights, bound = histograms()
+    found = gradient(lambda b: loss(weights, b), bound) * len(weights)
+    exact = -2 * (1 - bound.double() / weights.double()).clamp(min=0)
+    full = weights > 1e-37
+    return max(largest(found[full], exact[full]), largest(found, found))
+
+
 SWEEPS = (
     Sweep(
         what="how far samples stray from a single spike of 1e-44 to 1, of the ray's length",
@@ -130,6 +154,13 @@ SWEEPS = (
         usual=lambda: position_error(with_epsilons),
         ours=lambda: position_error(resample),
         tolerance=6e-5,  # half a digit of a position, 2^-24 of the ray, in the thousandth of it that weighs
+    ),
+    Sweep(
+        what="derivative of the proposal's loss, weights from 0 to 1",
+        usual_formula="(w - bound)^2 / (w + 1e-7), as published",
+        usual=lambda: proposal_slope_error(with_epsilon),
+        ours=lambda: proposal_slope_error(proposal_loss),
+        tolerance=1e-6,
     ),
     Sweep(
         what=f"positional encoding, {FREQUENCIES} frequencies, coordinates up to 8",

@@ -2,6 +2,7 @@
 
 import math
 import time
+from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
 
@@ -10,12 +11,15 @@ import pytest
 import torch
 from torch import Tensor
 
+from backend.errors import ErrorCode, ReconstructionError
 from backend.scene import Decision, Region, View, no_progress
 from backend.stages.deadline import deadline_after
 from backend.stages.measurements import measurements
+from backend.stages.neus_fit import NeusConfig, fit_neus
+from backend.stages.radiance_fit import RadianceConfig, fit_radiance
 from backend.stages.render_fit import Refined, RenderConfig, refine
 from backend.stages.safe_steps import PATIENCE, SafeSteps
-from backend.stages.stereo import StereoResult, match_views
+from backend.stages.stereo import StereoResult, match_views, unmatched
 from backend.stages.stereo_config import StereoConfig
 from backend.stages.train import Surface, TrainConfig, fit_surface
 from tests.synthetic_scene import Scene, photographed, ring_cameras, true_region
@@ -85,13 +89,13 @@ def test_no_seed_leads_to_what_is_not_a_number() -> None:
 
 
 def test_a_few_pixels_that_are_no_numbers_cost_a_few_steps() -> None:
-    one_pixel = spoiled(slice(24, 25), slice(32, 33))
+    one_pixel = spoiled(slice(20, 21), slice(30, 31))
     with_it, without = rendered(one_pixel, 40), rendered(scene().views, 40)
     assert with_it.steps == 40
     assert 0 < with_it.taken_back < PATIENCE
     assert with_it.distance.isfinite().all()
     apart = float((with_it.distance - without.distance).abs().max())
-    assert apart < moved(without), "it keeps most of what is learnt"
+    assert apart < 0.5 * moved(without), "what was learnt ten steps before is kept"
     because = told(fitted(one_pixel, 40)).because
     assert because.startswith(f"the preset; {with_it.taken_back} steps led to numbers that are not finite")
 
@@ -101,6 +105,27 @@ def test_photographs_without_numbers_leave_the_field_as_it_was() -> None:
     np.testing.assert_array_equal(surface.distance, linear().distance)
     assert told(surface).choice == "left out"
     assert told(surface).because.startswith(f"{PATIENCE} steps led to numbers that are not finite")
+
+
+# networks learned by rendering
+
+
+def learned(fit: Callable[..., Surface], views: tuple[View, ...]) -> Surface:
+    """A radiance field, or NeuS, of hardly any steps."""
+    small = (
+        RadianceConfig(steps=6, rays=64, nodes=24) if fit is fit_radiance else NeusConfig(steps=6, nodes=24)
+    )
+    chance = torch.Generator().manual_seed(0)
+    return fit(
+        views, true_region(), unmatched(views), small, device=CPU, generator=chance, progress=no_progress
+    )
+
+
+@pytest.mark.parametrize("fit", [fit_radiance, fit_neus])
+def test_networks_that_learn_nothing_but_what_is_no_number_are_an_error(fit: Callable[..., Surface]) -> None:
+    with pytest.raises(ReconstructionError, match="Nothing could be learned from the photographs") as raised:
+        learned(fit, spoiled(slice(None), slice(None)))
+    assert raised.value.code == ErrorCode.NO_SURFACE
 
 
 # the steps alone
