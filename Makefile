@@ -5,7 +5,7 @@ BPY := .venv-blender/bin/python
 BLENDER ?= blender
 DEMO := build/demo
 
-.PHONY: help demo test test-blender check benchmark ablation scaling extension screenshots
+.PHONY: help demo test test-blender check benchmark ablation scaling points extension screenshots
 .DELETE_ON_ERROR:
 
 help:
@@ -17,6 +17,7 @@ help:
 	@echo "make screenshots BLENDER=blender    the pictures of the add-on in docs/images"
 	@echo "make benchmark SUITE=quick   speed against error: table and plot; also scenes, photos; BUDGETS=\"10 20\""
 	@echo "make ablation CASES=\"monkey_3 plaster_6\"   what each part is worth; SEEDS=3 for medians"
+	@echo "make points    surfaces from points alone beside screened Poisson"
 	@echo "make scaling   how time and memory grow with views, pixels and the grid"
 
 demo: .venv/.ready $(DEMO)/scene/transforms.json
@@ -87,6 +88,9 @@ ablation: .venv/.ready .venv-blender/.ready
 scaling: .venv/.ready .venv-blender/.ready
 	$(BPY) -m benchmarks.render_scenes --cases monkey_12 --output $(BENCHMARK)/scenes
 	$(BACKEND) -m benchmarks.scaling --case monkey_12 --output $(BENCHMARK)/scaling --scenes $(BENCHMARK)/scenes
+
+points: .venv/.ready
+	$(BACKEND) -m benchmarks.points --data $(DATA) --output $(BENCHMARK)/points
 
 .venv/.ready: pyproject.toml constraints.txt
 	$(PYTHON) -m venv .venv

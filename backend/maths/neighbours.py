@@ -30,14 +30,14 @@ def neighbour_planes(points: Float64[np.ndarray, "points 3"], count: int = 20) -
 def crowding(points: Float64[np.ndarray, "points 3"], count: int = 12) -> Float64[np.ndarray, "points"]:
     """How much a point is to be trusted, 0 to 1: 1 where neighbours are near, less the lonelier it is.
 
-    The area that `count` neighbours take is held against that of the cloud's denser quarter: four times
-    that is a half. Up to half of the cloud may be strays that lie in the open.
+    The area that `count` neighbours take is held against that of the cloud's denser quarter: twice that is
+    a half. Up to half of the cloud may be strays that lie in the open.
     """
     count = min(count, len(points) - 1)
     reach, _ = cKDTree(points).query(points, k=[count + 1], workers=-1)
     area = reach[:, 0] ** 2
     usual = np.quantile(area, 0.25)
-    return np.asarray(1 / (1 + (area / (4 * max(usual, np.finfo(float).tiny))) ** 2))
+    return np.asarray(1 / (1 + (area / (2 * max(usual, np.finfo(float).tiny))) ** 2))
 
 
 def against_neighbours(

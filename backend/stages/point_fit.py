@@ -40,6 +40,8 @@ _MARGIN = 1.25
 """Half a side of the cube over half the widest extent of the cloud."""
 _MOST_FLIPPED = 0.1
 """Share of normals against their neighbours'; more, and the signs are chance."""
+_SURE = 0.25
+"""Trust of points that bound the cube and tell the networks: three and a half times the usual area."""
 _GREY = 180
 
 
@@ -108,7 +110,7 @@ def fit_points(
         decisions.append(_decision("points", f"{config.most_points} of {len(positions)}", "drawn by lot"))
         positions, normals = positions[drawn], None if normals is None else normals[drawn]
     trust = crowding(positions)
-    low, high = _extent(positions[trust > 0.1])
+    low, high = _extent(positions[trust > _SURE])
     frame = to_unit_sphere((low + high) / 2, _MARGIN * float((high - low).max()) / 2)
     placed = transform_points(frame, positions)
     near = (np.abs(placed) < 1).all(axis=1)
@@ -118,7 +120,7 @@ def fit_points(
         distance, made = _fit_linear(points, config, generator=generator, progress=progress)
         decisions += made
     else:
-        sure = torch.tensor(placed[trust > 0.1], dtype=torch.float32, device=device)
+        sure = torch.tensor(placed[trust > _SURE], dtype=torch.float32, device=device)
         distance = fit_network(
             sure, config.nodes, config.method, config.network, generator=generator, progress=progress
         )
@@ -197,7 +199,7 @@ def _points(
 def _fit_linear(
     points: _Points, config: PointFitConfig, *, generator: torch.Generator, progress: Progress
 ) -> tuple[Float[Tensor, "nodes nodes nodes"], list[Decision]]:
-    sure = points.positions[points.trust > 0.1]
+    sure = points.positions[points.trust > _SURE]
     sides = fit_network(
         sure,
         _COARSE[-1],

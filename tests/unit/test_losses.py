@@ -137,3 +137,69 @@ def test_gradients_agree_with_finite_differences() -> None:
     assert check(losses.eikonal, g)
     assert check(lambda t: losses.silhouette(t, m), t)
     assert check(lambda f: losses.entropy_of_side(f, 3.0), f)
+
+
+def test_a_pull_along_the_true_distance_ends_on_the_nearest_point() -> None:
+    """f = |q| - 1: q - f grad f is q / |q|. From any other point the loss is the distance to that."""
+    query = draw(50, 3)
+    reach = query.norm(dim=-1)
+    nearest = query / reach[:, None]
+    torch.testing.assert_close(
+        losses.pull(reach - 1, 5 * nearest, nearest - query), torch.zeros(50, dtype=torch.float64)
+    )
+    other = torch.nn.functional.normalize(draw(50, 3, seed=1), dim=-1)
+    expected = (nearest - other).norm(dim=-1)
+    torch.testing.assert_close(losses.pull(reach - 1, nearest, other - query), expected)
+
+
+def test_a_newton_pull_is_the_same_for_a_field_of_any_slope() -> None:
+    query = draw(50, 3)
+    reach = query.norm(dim=-1)
+    nearest = query / reach[:, None]
+    off = losses.newton_pull(7 * (reach - 1), 7 * nearest, nearest - query, least_slope=0.1)
+    torch.testing.assert_close(off, torch.zeros(50, dtype=torch.float64))
+
+
+@pytest.mark.parametrize("kind", ["pull", "newton"])
+def test_pulls_are_bounded_with_finite_derivatives_where_the_gradient_vanishes(kind: str) -> None:
+    gradient = torch.zeros(1, 3, requires_grad=True)
+    value, apart = torch.ones(1), torch.tensor([[3.0, 4.0, 0.0]])
+    if kind == "pull":
+        off = losses.pull(value, gradient, apart)
+    else:
+        off = losses.newton_pull(value, gradient, apart, least_slope=0.1)
+    assert off.item() == pytest.approx(5.0)
+    assert gradient_of(off, gradient).isfinite().all()
+
+
+def test_the_worst_offset_raises_a_linear_loss_by_radius_times_slope() -> None:
+    """And no other offset of the same length raises it more."""
+    slope, radius = (
+        draw(20, 3),
+        torch.rand(20, dtype=torch.float64, generator=torch.Generator().manual_seed(2)),
+    )
+    offset = losses.worst_offset(slope, radius)
+    rise = (slope * offset).sum(dim=-1)
+    torch.testing.assert_close(rise, radius * slope.norm(dim=-1))
+    others = radius[:, None] * torch.nn.functional.normalize(draw(1000, 20, 3, seed=3), dim=-1)
+    assert ((slope * others).sum(dim=-1) <= rise + 1e-12).all()
+    assert not losses.worst_offset(torch.zeros(4, 3), torch.ones(4)).any()
+
+
+def test_log_mean_exp_lies_between_mean_and_maximum_and_reaches_both() -> None:
+    drawn = draw(7, 30).abs()
+    middle = losses.log_mean_exp(drawn, 0.3)
+    assert (middle > drawn.mean(dim=0)).all()
+    assert (middle < drawn.amax(dim=0)).all()
+    torch.testing.assert_close(losses.log_mean_exp(drawn, 1e6), drawn.mean(dim=0), rtol=0, atol=1e-5)
+    torch.testing.assert_close(losses.log_mean_exp(drawn, 1e-4), drawn.amax(dim=0), rtol=0, atol=1e-3)
+    plain = 0.3 * torch.log(torch.exp(drawn / 0.3).mean(dim=0))
+    torch.testing.assert_close(middle, plain)
+
+
+def test_log_mean_exp_does_not_overflow() -> None:
+    """Losses of a thousand temperatures: e^1000 is no number, the answer is."""
+    drawn = torch.tensor([[1000.0], [999.0]])
+    assert torch.isinf(torch.exp(drawn).mean())
+    expected = 1000 + math.log((1 + math.exp(-1)) / 2)
+    assert losses.log_mean_exp(drawn, 1.0).item() == pytest.approx(expected, rel=1e-6)

@@ -1,0 +1,105 @@
+"""The command `fit-points` as a process: its words, its exit code and its files."""
+
+import json
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+from backend.commands.fit_points import POINT_METHODS
+from backend.mesh_files import read_mesh
+from backend.stages.point_network import METHODS
+from backend.wire.protocol import Failed, Finished, Hello, Stage, decode
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def command(*arguments: object) -> list[str]:
+    return [sys.executable, "-m", "backend", "fit-points", *map(str, arguments)]
+
+
+def finished(*arguments: object) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        command(*arguments), capture_output=True, text=True, timeout=300, cwd=ROOT, check=False
+    )
+
+
+@pytest.fixture
+def cloud(tmp_path: Path) -> Path:
+    points = np.random.default_rng(0).normal(size=(400, 3))
+    path = tmp_path / "cloud.xyz"
+    np.savetxt(path, points / np.linalg.norm(points, axis=1, keepdims=True))
+    return path
+
+
+@pytest.mark.slow
+def test_a_cloud_becomes_a_mesh_with_its_numbers(cloud: Path, tmp_path: Path) -> None:
+    truth, output = tmp_path / "truth.ply", tmp_path / "out"
+    trimesh.creation.icosphere(subdivisions=4).export(truth)
+    run = finished(cloud, "--output", output, "--truth", truth)
+    assert run.returncode == 0, run.stderr
+    assert {path.name for path in output.iterdir()} == {".fewview", "mesh.ply", "report.json"}
+    assert str(output / "mesh.ply") in run.stdout
+    report = json.loads((output / "report.json").read_text())
+    assert report["watertight"]
+    assert report["num_faces"] == len(read_mesh(output / "mesh.ply").faces)
+    assert report["error"]["chamfer_percent"] < 0.5
+    refused = finished(cloud, "--output", tmp_path)
+    assert refused.returncode == 2
+    assert "FewView did not make" in refused.stderr
+
+
+@pytest.mark.slow
+def test_on_the_wire_it_says_its_stages_and_ends_once(cloud: Path, tmp_path: Path) -> None:
+    process = subprocess.Popen(
+        command(cloud, "--output", tmp_path / "out", "--wire"),
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        text=True,
+        cwd=ROOT,
+    )
+    with process:
+        assert process.stdout is not None
+        said = [decode(line) for line in process.stdout]
+    assert process.returncode == 0
+    assert isinstance(said[0], Hello)
+    assert [m.name for m in said if isinstance(m, Stage)] == ["points", "surface", "mesh"]
+    assert isinstance(said[-1], Finished)
+    assert said[-1].files == ("mesh.ply", "report.json")
+    assert not any(isinstance(m, Failed) for m in said)
+
+
+def test_a_cloud_without_points_is_refused_and_leaves_nothing(tmp_path: Path) -> None:
+    path = tmp_path / "cloud.xyz"
+    path.write_text("nan nan nan\n" * 100)
+    run = finished(path, "--output", tmp_path / "out")
+    assert run.returncode == 2
+    assert "0 different points" in run.stderr
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX")
+def test_ctrl_c_leaves_nothing(cloud: Path, tmp_path: Path) -> None:
+    with subprocess.Popen(
+        command(cloud, "--output", tmp_path / "out", "--method", "nap"), stderr=subprocess.PIPE, cwd=ROOT
+    ) as process:
+        assert process.stderr is not None
+        for line in process.stderr:
+            if b"points done" in line:
+                break
+        time.sleep(1)
+        process.send_signal(signal.SIGINT)
+        process.stderr.read()
+    assert process.returncode == 130
+    assert not (tmp_path / "out").exists()
+
+
+def test_the_command_offers_the_methods_there_are() -> None:
+    assert set(POINT_METHODS) == {"linear", *METHODS}

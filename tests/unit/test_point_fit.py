@@ -1,0 +1,147 @@
+"""Shapes that are known, given back from points on them that are noisy, strayed, flipped or few."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from backend.errors import Cancelled, ErrorCode, ReconstructionError
+from backend.scene import SurfaceMesh, no_progress
+from backend.stages.mesh import MeshConfig
+from backend.stages.point_cloud import PointCloud, clean_cloud
+from backend.stages.point_fit import PointFitConfig, fit_points, mesh_of_points
+from backend.stages.point_network import METHODS, NetworkConfig
+
+CPU = torch.device("cpu")
+QUICK = PointFitConfig(
+    nodes=64,
+    sides=NetworkConfig(width=32, layers=2, steps=150, batch=500),
+    network=NetworkConfig(width=32, layers=3, steps=400, batch=1000),
+)
+CENTRE, RADIUS = np.array([50.0, -20.0, 3.0]), 4.0
+TUBE = 0.4
+"""Of the torus, whose middle circle has the radius 1."""
+
+
+def sphere(count: int, noise: float, seed: int = 0) -> np.ndarray:
+    """Around CENTRE; the noise is in radii."""
+    rng = np.random.default_rng(seed)
+    points = rng.normal(size=(count, 3))
+    points /= np.linalg.norm(points, axis=1, keepdims=True)
+    return np.asarray(CENTRE + RADIUS * (points + noise * rng.normal(size=points.shape)))
+
+
+def fitted(cloud: PointCloud, config: PointFitConfig = QUICK, seed: int = 0) -> SurfaceMesh:
+    torch.manual_seed(1234 + seed)  # must not matter
+    generator = torch.Generator().manual_seed(seed)
+    surface = fit_points(cloud, config, device=CPU, generator=generator, progress=no_progress)
+    return mesh_of_points(surface, cloud, MeshConfig(), progress=no_progress)
+
+
+def off_sphere(mesh: SurfaceMesh) -> np.ndarray:
+    """Distance of each vertex from the sphere, in radii."""
+    return np.abs(np.linalg.norm(mesh.vertices - CENTRE, axis=1) / RADIUS - 1)
+
+
+def closed(mesh: SurfaceMesh) -> trimesh.Trimesh:
+    """The mesh, closed and with its faces outwards."""
+    made = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
+    assert made.is_watertight
+    assert made.volume > 0
+    return made
+
+
+def test_a_noisy_sphere_without_normals() -> None:
+    """Some 40 points a patch of the grid's reach: less than half of their noise is left."""
+    noise = 0.04
+    mesh = fitted(clean_cloud(sphere(3000, noise), None))
+    assert closed(mesh).euler_number == 2
+    assert off_sphere(mesh).mean() < noise / 2
+    assert mesh.support.min() > 0.2
+
+
+def test_a_torus_keeps_its_hole() -> None:
+    rng = np.random.default_rng(0)
+    around, across = rng.uniform(0, 2 * np.pi, (2, 3000))
+    ring = 1 + TUBE * np.cos(across)
+    points = np.stack([ring * np.cos(around), ring * np.sin(around), TUBE * np.sin(across)], axis=1)
+    mesh = fitted(clean_cloud(points, None))
+    assert closed(mesh).euler_number == 0
+    to_circle = np.linalg.norm(mesh.vertices[:, :2], axis=1) - 1
+    off = np.abs(np.hypot(to_circle, mesh.vertices[:, 2]) - TUBE)
+    assert off.mean() < 0.01
+
+
+def test_known_normals_are_met() -> None:
+    """A gap of a sixth of the sphere is closed by them; without noise what is left is the grid's."""
+    points = sphere(2000, 0.0)
+    points = points[points[:, 2] < CENTRE[2] + 0.66 * RADIUS]
+    mesh = fitted(clean_cloud(points, (points - CENTRE) / RADIUS), replace(QUICK, normals_known=True))
+    closed(mesh)
+    assert np.median(off_sphere(mesh)) < 0.005
+    assert off_sphere(mesh).max() < 0.15
+
+
+def test_half_of_the_points_are_strays() -> None:
+    strays = CENTRE + RADIUS * np.random.default_rng(1).uniform(-1.3, 1.3, (1500, 3))
+    mesh = fitted(clean_cloud(np.concatenate([sphere(1500, 0.01), strays]), None))
+    closed(mesh)
+    assert np.median(off_sphere(mesh)) < 0.03
+    assert (off_sphere(mesh) < 0.1).mean() > 0.9
+
+
+def test_normals_flipped_at_random_are_noticed() -> None:
+    points = sphere(1500, 0.0)
+    signs = np.random.default_rng(0).choice([-1, 1], (1500, 1))
+    mesh = fitted(clean_cloud(points, signs * (points - CENTRE)), replace(QUICK, normals_known=True))
+    closed(mesh)
+    assert off_sphere(mesh).mean() < 0.01
+    assert any(d.what == "normals" and "signs left out" in d.choice for d in mesh.decisions)
+
+
+@pytest.mark.parametrize("method", sorted(METHODS))
+def test_each_network_finds_the_sphere(method: str) -> None:
+    """They begin as a ball elsewhere and of half the size."""
+    mesh = fitted(clean_cloud(sphere(500, 0.01), None), replace(QUICK, method=method))
+    assert closed(mesh).euler_number == 2
+    assert off_sphere(mesh).mean() < 0.03
+
+
+def test_the_same_seed_gives_the_same_surface_and_scale_does_not_matter() -> None:
+    cloud = clean_cloud(sphere(300, 0.01), None)
+    quick = replace(QUICK, nodes=48)
+    once, again = (fitted(cloud, quick) for _ in range(2))
+    np.testing.assert_array_equal(once.vertices, again.vertices)
+    large = fitted(replace(cloud, positions=1024.0 * cloud.positions), quick)
+    np.testing.assert_allclose(large.vertices / 1024, once.vertices, atol=1e-3 * RADIUS)
+
+
+def test_points_beyond_the_most_are_drawn() -> None:
+    mesh = fitted(clean_cloud(sphere(900, 0.0), None), replace(QUICK, nodes=48, most_points=400))
+    assert ("points", "400 of 900") in [(d.what, d.choice) for d in mesh.decisions]
+    assert off_sphere(mesh).mean() < 0.02
+
+
+def test_known_normals_that_are_not_there() -> None:
+    cloud = clean_cloud(sphere(100, 0.0), None)
+    with pytest.raises(ReconstructionError) as caught:
+        fitted(cloud, replace(QUICK, normals_known=True))
+    assert caught.value.code == ErrorCode.CLOUD_UNUSABLE
+    assert "--normals-known" in caught.value.remedy
+
+
+def test_a_fit_is_cancelled_between_two_steps() -> None:
+    def stop(fraction: float, _text: str) -> None:
+        if fraction > 0.1:
+            raise Cancelled
+
+    with pytest.raises(Cancelled):
+        fit_points(
+            clean_cloud(sphere(100, 0.0), None),
+            QUICK,
+            device=CPU,
+            generator=torch.Generator().manual_seed(0),
+            progress=stop,
+        )
