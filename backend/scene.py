@@ -139,7 +139,7 @@ class CameraEvidence:
     """Of each camera's orientation (rotation vector, world axes, radians) and centre (world units), in the
     frame of the cameras as a whole (maths/gauge.py). None where nothing is left over to tell errors from."""
     lenses_free: bool
-    """Whether that counts what photographs leave open of the lenses; where they tell nothing of them, not."""
+    """Whether that counts what photographs leave open of the lenses; not where they tell hardly anything."""
     point_sigma_world: Float64[np.ndarray, "points"] | None
     """Standard deviation of each sparse point where it is least sure, the cameras held."""
 

@@ -39,9 +39,8 @@ def in_gauge_of_the_whole(
     It is projected off the motions of the whole, in coordinates without units, where the projection is an
     orthogonal one. `positions` are at least two different centres.
     """
-    apart = (positions - positions.mean(axis=0)) / length_world
     units = np.tile(np.repeat([1.0, length_world], 3), len(positions))
-    motions, _ = np.linalg.qr(similarity_motions(apart))
+    motions, _ = np.linalg.qr(similarity_motions(positions / length_world))
     across = np.eye(len(units)) - motions @ motions.T
     free = across @ (covariance / np.outer(units, units)) @ across * np.outer(units, units)
     return np.asarray((free + free.T) / 2, np.float64)

@@ -2,7 +2,6 @@
 
 import math
 from dataclasses import replace
-from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -10,13 +9,11 @@ import PIL.Image  # noqa: F401 - before pycolmap
 import pycolmap
 import pytest
 import torch
-import trimesh
 from scipy.spatial.transform import Rotation
 
 from backend.errors import ErrorCode, ReconstructionError
 from backend.maths.angles import angles_between
 from backend.maths.geometry import (
-    Pinhole,
     epipolar_map,
     inside,
     pinhole_in_object,
@@ -25,31 +22,14 @@ from backend.maths.geometry import (
     warp_pixels,
 )
 from backend.maths.raycast import in_picture
-from backend.mesh_files import write_glb
 from backend.scene import Camera, Region, SolvedCameras, no_progress, transform_points
 from backend.stages.camera_evidence import covariances_or_none, offsets_px
 from backend.stages.cameras import CamerasConfig, solve_cameras
-from backend.stages.mesh import MeshConfig, extract_mesh
-from backend.stages.region import RegionConfig, find_region
-from backend.stages.stereo import StereoResult, match_views
-from backend.stages.stereo_config import StereoConfig
-from backend.stages.train import Surface, TrainConfig, fit_surface
 from backend.stages.triangulation import two_view_points
 from tests.ridge_photos import FOCAL_PX, arc_pose, look_at_origin, make_photo, render
-from tests.synthetic_scene import (
-    CENTRE,
-    SIZE,
-    Scene,
-    arc_cameras,
-    diagonal,
-    photographed,
-    surface_distance,
-    true_region,
-)
 
 CPU = torch.device("cpu")
 ANGLES = tuple(10.0**-power for power in range(1, 8))
-QUICK_STEREO = StereoConfig(first_pixel_size=1, num_sources=2, growth_rounds=(1, 1, 1))
 
 
 def camera_at(position: np.ndarray, focal_px: float = 1000.0) -> Camera:
@@ -192,6 +172,7 @@ def two_views(points: np.ndarray, camera_b: np.ndarray) -> tuple[np.ndarray, np.
     return rays[0], rays[1]
 
 
+@pytest.mark.slow
 def test_a_plane_does_not_mislead_the_cameras(tmp_path: Path) -> None:
     """Eight points of a plane leave two more directions open; COLMAP asks a homography as well."""
     pose = np.eye(4)
@@ -214,6 +195,7 @@ def test_a_plane_does_not_mislead_the_cameras(tmp_path: Path) -> None:
     assert not solved.evidence.lenses_free, "a plane does not tell the lens"
 
 
+@pytest.mark.slow
 def test_a_turn_on_the_spot_is_refused(tmp_path: Path) -> None:
     """The eight-point algorithm gives a baseline of length 1 where there is none."""
     pose = np.eye(4)
@@ -285,184 +267,3 @@ def test_the_reported_uncertainty_grows_as_the_baseline_shrinks() -> None:
         assert np.std(found[:, 2] - true[:, 2]) == pytest.approx(np.median(sigmas), rel=0.3)
         usual_px.append(float(np.sqrt((offsets**2).mean())))
     assert max(usual_px) / min(usual_px) < 1.2
-
-
-# Very long and very short lenses.
-
-
-def through_lens(distance: float) -> Scene:
-    """The body, filling the pictures, from so many of its sizes; a lens as long as it takes."""
-    cameras = []
-    for camera in arc_cameras(3, 30, 160):
-        zoom = math.sqrt((distance**2 - 1) / 15)  # what touches a ball of SIZE at the usual distance of 4
-        pose = camera.camera_from_world.copy()
-        pose[:3, 3] = -pose[:3, :3] @ (CENTRE + (camera.position - CENTRE) * distance / 4)
-        cameras.append(
-            replace(camera, camera_from_world=pose, fx_px=camera.fx_px * zoom, fy_px=camera.fy_px * zoom)
-        )
-    return photographed(cameras)
-
-
-@pytest.mark.parametrize(
-    ("distance", "focal_widths", "num_points"), [(1.35, 0.34, 10_000), (400.0, 150.0, 20_000)]
-)
-def test_depth_through_very_short_and_very_long_lenses(
-    distance: float, focal_widths: float, num_points: int
-) -> None:
-    """112 degrees, and 0.4; as exact as a normal lens, whose median error is 0.06 % of the diagonal."""
-    scene = through_lens(distance)
-    assert scene.cameras[0].fx_px / 160 == pytest.approx(focal_widths, rel=0.01)
-    result = match_views(scene.views, true_region(), QUICK_STEREO, device=CPU, progress=no_progress)
-    points = transform_points(true_region().world_from_object, result.points.positions.astype(np.float64))
-    assert len(points) > num_points
-    assert np.median(np.abs(surface_distance(points))) < 0.0008 * diagonal()
-
-
-def test_a_search_to_twice_the_depth_has_no_steps_left_for_a_long_lens() -> None:
-    """The usual range, from the nearest depth to a multiple of it, in steps of one pixel of disparity."""
-    num_steps = QUICK_STEREO.num_planes
-    for distance in (4.0, 400.0):
-        cameras = [pinhole_in_object(c, true_region(), CPU) for c in through_lens(distance).cameras[:2]]
-        _, b = epipolar_map(cameras[1], cameras[0])
-        middle = float(cameras[0].camera_from_object[2, 3])
-        pixels_per_inverse_depth = float(b[:2].norm())
-        usual = pixels_per_inverse_depth * (1 / (middle - 1) - 1 / (2 * (middle - 1)))
-        ours = pixels_per_inverse_depth * (1 / (middle - 1) - 1 / (middle + 2))
-        assert ours < 2 * num_steps, "semi-global matching finds what lies between two"
-        assert (usual > 10 * num_steps) == (distance == 400.0)
-
-
-# Scenes of any size, anywhere.
-
-
-def moved(scene: Scene, scale: float, shift: np.ndarray) -> SolvedCameras:
-    """The same photographs in another world."""
-    views = []
-    for view in scene.views:
-        pose = view.camera.camera_from_world.copy()
-        pose[:3, 3] = -pose[:3, :3] @ (scale * view.camera.position + shift)
-        views.append(replace(view, camera=replace(view.camera, camera_from_world=pose)))
-    return replace(scene.solved(), views=tuple(views))
-
-
-@cache
-def small_scene() -> Scene:
-    return photographed(arc_cameras(3, 40, 80))
-
-
-def fitted(solved: SolvedCameras) -> tuple[Region, StereoResult, Surface]:
-    region = find_region(solved, RegionConfig(), progress=no_progress)
-    stereo = match_views(solved.views, region, QUICK_STEREO, device=CPU, progress=no_progress)
-    config = TrainConfig(levels=(32,), rounds=(4,), steps=(0,))
-    surface = fit_surface(
-        solved.views,
-        region,
-        stereo,
-        config,
-        device=CPU,
-        generator=torch.Generator().manual_seed(0),
-        progress=no_progress,
-    )
-    return region, stereo, surface
-
-
-@cache
-def fitted_here() -> tuple[Region, StereoResult, Surface]:
-    return fitted(moved(small_scene(), 1.0, np.zeros(3)))
-
-
-WORLDS = pytest.mark.parametrize(("scale", "shift"), [(1e-4, 0.0), (1e5, 0.0), (1.0, 1e6)], ids=str)
-
-
-@WORLDS
-def test_the_result_is_the_same_in_any_world(scale: float, shift: float) -> None:
-    """Region, depths, field and mesh up to the similarity, to 1e-4 of the subject's size.
-
-    The field gets its input to 1e-9. A point that this moves into the next cube of merged ones moves the
-    nodes around by more, up to 1e-4 of the cube.
-    """
-    offset = np.array([shift, -shift, shift])
-    solved = moved(small_scene(), scale, offset)
-    region, stereo, surface = fitted(solved)
-    here = fitted_here()
-    assert region.radius_world == pytest.approx(scale * here[0].radius_world, rel=1e-9)
-    apart = (region.centre_world - offset) / scale - here[0].centre_world
-    assert np.abs(apart).max() < 1e-9 * here[0].radius_world
-    assert len(stereo.points.positions) == len(here[1].points.positions)
-    np.testing.assert_allclose(stereo.points.positions, here[1].points.positions, atol=1e-4)
-    for one, other in zip(stereo.depth_maps, here[1].depth_maps, strict=True):
-        np.testing.assert_allclose(one.depth, other.depth, rtol=1e-4)
-    field_apart = np.abs(surface.distance - here[2].distance)
-    assert field_apart.max() < 1e-4 * 2, "the cube is 2 wide"
-    assert field_apart.mean() < 1e-6
-    config = MeshConfig(max_faces=1_000_000)
-    mesh = extract_mesh(solved.views, region, stereo, surface, config, progress=no_progress)
-    other = extract_mesh(small_scene().views, *here, config, progress=no_progress)
-    np.testing.assert_array_equal(mesh.faces, other.faces)
-    size = np.ptp(other.vertices, axis=0).max()
-    assert np.abs((mesh.vertices - offset) / scale - other.vertices).max() < 1e-4 * size
-    np.testing.assert_allclose(mesh.support, other.support, atol=1e-3)
-
-
-@WORLDS
-def test_a_mesh_file_in_single_precision_keeps_its_digits(scale: float, shift: float, tmp_path: Path) -> None:
-    """glTF knows no doubles but in the transform of a node."""
-    offset = np.array([shift, -shift, shift])
-    views = small_scene().views
-    mesh = extract_mesh(views, *fitted_here(), MeshConfig(), progress=no_progress)
-    mesh = replace(mesh, vertices=scale * mesh.vertices + offset)
-    size = np.ptp(mesh.vertices, axis=0).max()
-    usual = np.abs(mesh.vertices.astype(np.float32) - mesh.vertices).max()
-    assert (usual > 1e-4 * size) == (shift != 0)
-    write_glb(tmp_path / "mesh.glb", mesh)
-    found = np.asarray(trimesh.load_scene(tmp_path / "mesh.glb").to_mesh().vertices)
-    found = np.stack([found[:, 0], -found[:, 2], found[:, 1]], axis=1)
-    assert np.abs(found - mesh.vertices).max() < 1e-6 * size
-
-
-def test_projection_in_single_precision_where_maps_are_drawn() -> None:
-    """K [R | t] in single precision is off by pixels at 1e6; through the object's frame it is not."""
-    camera = moved(small_scene(), 1.0, np.array([1e6, -1e6, 1e6])).views[0].camera
-    points = true_region().world_from_object[:3, 3] + SIZE * np.random.default_rng(0).uniform(
-        -0.5, 0.5, (200, 3)
-    )
-    here = small_scene().views[0].camera
-    exact = pixels_of(here, points)
-    far = points + np.array([1e6, -1e6, 1e6])
-    matrix = (camera.intrinsics @ camera.camera_from_world[:3]).astype(np.float32)
-    homogeneous = far.astype(np.float32) @ matrix[:, :3].T + matrix[:, 3]
-    usual = homogeneous[:, :2] / homogeneous[:, 2:]
-    assert np.abs(usual - exact).max() > 1
-    object_from_world = np.eye(4)
-    object_from_world[:3, :3] /= SIZE
-    object_from_world[:3, 3] = -(CENTRE + np.array([1e6, -1e6, 1e6])) / SIZE
-    region = Region(object_from_world=object_from_world)
-    in_object = torch.tensor(transform_points(object_from_world, far), dtype=torch.float32)
-    ours, _ = project(pinhole_in_object(camera, region, CPU), in_object)
-    assert np.abs(ours.numpy() - exact).max() < 1e-3
-
-
-def test_warps_in_single_precision() -> None:
-    """Against double precision, in pixels of a picture 160 wide; the longer the lens, the more cancels."""
-    for distance, tolerance_px in ((1.35, 1e-4), (4.0, 1e-4), (40.0, 5e-4), (400.0, 2e-3)):
-        scene = through_lens(distance)
-        cameras = [pinhole_in_object(c, true_region(), CPU) for c in scene.cameras[:2]]
-        exact = [in_double(c) for c in scene.cameras[:2]]
-        inverse_depth = torch.tensor(true_region().radius_world / scene.depths[0])[None]
-        pixels = pixel_centres(160, 120, CPU)
-        single = warp_pixels(*epipolar_map(cameras[1], cameras[0]), pixels, inverse_depth.float())
-        double = warp_pixels(*epipolar_map(exact[1], exact[0]), pixels.double(), inverse_depth)
-        on_body = torch.tensor(np.isfinite(scene.depths[0]))
-        assert float((single - double)[0][on_body].abs().max()) < tolerance_px
-
-
-def in_double(camera: Camera) -> Pinhole:
-    region = true_region()
-    pose = camera.camera_from_world @ region.world_from_object
-    pose[:3] /= region.radius_world
-    return Pinhole(
-        intrinsics=torch.tensor(camera.intrinsics),
-        camera_from_object=torch.tensor(pose),
-        width=camera.width,
-        height=camera.height,
-    )

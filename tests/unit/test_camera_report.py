@@ -164,6 +164,9 @@ def test_given_cameras_have_no_matches_to_show() -> None:
     numbers = camera_report_numbers(report_of(given))
     assert numbers["pairs"] == []
     assert numbers["pose_covariance_rad_world"] is None
+    assert "How many photographs see a point" in page, "some are seen by three"
+    pairs = replace(given, sparse_visibility=np.tile([True, True, False], (40, 1)))
+    assert "How many photographs see a point" not in camera_report_html(report_of(pairs))
     bare = replace(given, sparse_positions=np.zeros((0, 3)), sparse_visibility=np.zeros((0, 3), bool))
     page = camera_report_html(report_of(bare))
     assert "At which angle they see it" not in page

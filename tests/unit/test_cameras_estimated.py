@@ -53,6 +53,7 @@ def test_cameras_of_rendered_photographs(focal_px: float | None, corner: list[Ph
     assert solved.estimated
     assert solved.reprojection_error_px is not None
     assert solved.reprojection_error_px < 0.5
+    check_evidence(solved)
     first, *others = solved.views
     for view in others:
         ours = view.camera.camera_from_world @ np.linalg.inv(first.camera.camera_from_world)
@@ -61,6 +62,27 @@ def test_cameras_of_rendered_photographs(focal_px: float | None, corner: list[Ph
         cosine = ours[:3, 3] @ true[:3, 3] / np.linalg.norm(ours[:3, 3]) / np.linalg.norm(true[:3, 3])
         assert cosine > math.cos(math.radians(1.0))
         assert view.camera.fx_px == pytest.approx(FOCAL_PX, rel=0.02)
+
+
+def check_evidence(solved: SolvedCameras) -> None:
+    """Of the ridge and one photograph of noise: who matches, how far off, and how sure to within a factor."""
+    evidence = solved.evidence
+    assert evidence is not None
+    assert evidence.names == (*POSES, "noise.png")
+    np.testing.assert_array_equal(evidence.num_verified, evidence.num_verified.T)
+    assert (evidence.num_matched >= evidence.num_verified).all()
+    assert (evidence.num_verified[:3, :3][~np.eye(3, dtype=bool)] > 50).all()
+    assert not evidence.num_verified[3].any()
+    assert (evidence.num_features > 0).all()
+    seen = solved.sparse_visibility
+    assert not evidence.error_px[~seen].any()
+    mean_px = (evidence.error_px.sum(axis=1) / seen.sum(axis=1)).mean()
+    assert mean_px == pytest.approx(solved.reprojection_error_px, rel=1e-3), "COLMAP's is a mean over points"
+    assert evidence.pose_covariance is not None
+    for covariance in evidence.pose_covariance:
+        assert (np.linalg.eigvalsh(covariance) > -1e-15).all()
+        turn_deg = np.degrees(np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1]))
+        assert 0.003 < turn_deg < 3, "true errors are about 0.1 degrees"
 
 
 def test_sparse_points_project_to_what_sees_them(corner: list[Photo], tmp_path: Path) -> None:
