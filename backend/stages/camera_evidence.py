@@ -13,6 +13,7 @@ from jaxtyping import Float64, Int64
 
 from ..maths.gauge import cross_matrix, in_gauge_of_the_whole
 from ..scene import CameraEvidence
+from .bundle_adjustment import bundle_adjuster
 from .lenses import shared_tracks
 
 FEWEST_FOR_LENSES = 3
@@ -109,15 +110,7 @@ def covariances_or_none(
     num_left = num_equations - 3 * len(tracks) - 6 * len(placed) - num_lens + 7
     if num_left <= 0:
         return None, None
-    config = pycolmap.BundleAdjustmentConfig()
-    for image_id in placed:
-        config.add_image(image_id)
-    config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
-    options = pycolmap.BundleAdjustmentOptions()
-    options.print_summary = False
-    options.refine_focal_length = lenses_free
-    options.refine_principal_point = options.refine_extra_params = lenses_free
-    adjuster = pycolmap.create_default_ceres_bundle_adjuster(options, config, model)
+    adjuster = bundle_adjuster(model, free_lens=lenses_free, robust_scale_px=None)
     found = pycolmap.estimate_ba_covariance(pycolmap.BACovarianceOptions(), model, adjuster)
     if found is None:
         return None, None
