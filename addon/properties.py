@@ -175,6 +175,7 @@ class FEWVIEW_PG_settings(bpy.types.PropertyGroup):
             ("fast", "Fast", "A first look"),
             ("balanced", "Balanced", "Good for most subjects"),
             ("detailed", "Detailed", "Fine structures, for sharp and large photographs"),
+            ("nerf", "NeRF", "For comparison: a radiance field, slow and with a rougher mesh"),
         ],
         default="balanced",
     )

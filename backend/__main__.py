@@ -1,4 +1,4 @@
-"""The command line: python -m backend reconstruct | doctor | install | rehearse | benchmark."""
+"""The command line: python -m backend reconstruct | render | doctor | install | rehearse | benchmark."""
 
 import argparse
 import faulthandler
@@ -14,6 +14,7 @@ from .commands.benchmark import add_benchmark, benchmark, positive_seconds
 from .commands.doctor import doctor_on_wire
 from .commands.reconstruct import EXIT_FINE, EXIT_USER_ERROR, on_terminal, on_wire
 from .commands.rehearse import rehearse
+from .commands.render import add_render, render
 from .waiting import set_waiting_policy
 from .wire.environment import BUILDS
 from .wire.protocol import DEVICES, PRESETS, PROTOCOL_VERSION, Job
@@ -41,6 +42,8 @@ def run(arguments: list[str] | None) -> int:
         return _install(parsed)
     if parsed.command == "benchmark":
         return benchmark(parsed)
+    if parsed.command == "render":
+        return render(parsed)
     if parsed.command == "rehearse":
         return rehearse(parsed.output, seconds=parsed.seconds, end=parsed.end)
     return _reconstruct(parser, parsed)
@@ -118,6 +121,7 @@ def _parser() -> argparse.ArgumentParser:
         metavar="S",
         help="time for fitting the surface, the rest of the run not counted (what the preset needs)",
     )
+    add_render(commands.add_parser("render", help="pictures of a finished job from given cameras"))
     check = commands.add_parser("doctor", help="check that everything needed is there")
     form = check.add_mutually_exclusive_group()
     form.add_argument("--json", action="store_true", help="for programs")

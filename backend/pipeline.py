@@ -15,6 +15,7 @@ from functools import partial
 from importlib.metadata import version
 from itertools import takewhile
 from pathlib import Path
+from types import MappingProxyType
 
 import torch
 
@@ -23,15 +24,17 @@ from .maths.metrics import load_truth
 from .presets import Settings
 from .previews import Previews
 from .results import cameras_summary, summary, write_all, write_cameras
-from .scene import Decision, Photo, Region, SolvedCameras, SurfaceMesh
+from .scene import Decision, Photo, Region, SolvedCameras, SurfaceMesh, View
 from .stages.camera_refinement import match_solved, with_refined
 from .stages.cameras import solve_cameras
 from .stages.mesh import extract_mesh
 from .stages.photos import load_photos
+from .stages.radiance_field import Radiance
+from .stages.radiance_fit import RadianceConfig, fit_radiance
 from .stages.region import find_region
 from .stages.report import Report, ReportInputs, StageTiming, build_report
 from .stages.stereo import StereoResult
-from .stages.train import Surface, fit_surface
+from .stages.train import Surface, TrainConfig, fit_surface
 from .version import VERSION
 from .workspace import StageCost, Workspace, check_free_space, fingerprint
 
@@ -66,6 +69,23 @@ class Job:
     """"cameras" to end when cameras and region are known; a later run of the whole goes on from there."""
 
 
+FITS: typing.Mapping[type, Callable[..., Surface]] = MappingProxyType(
+    {TrainConfig: fit_surface, RadianceConfig: fit_radiance}
+)
+"""What is fitted, by the type of its settings."""
+
+
+def fit_by_settings(
+    views: tuple[View, ...],
+    region: Region,
+    stereo: StereoResult,
+    config: TrainConfig | RadianceConfig,
+    **keywords: typing.Any,
+) -> Surface:
+    """The surface as the type of the settings asks for it; each of FITS has the same arguments."""
+    return FITS[type(config)](views, region, stereo, config, **keywords)
+
+
 @dataclass(frozen=True, kw_only=True)
 class Stages:
     """The work itself, so that a test can put something quick in its place.
@@ -77,7 +97,7 @@ class Stages:
     solve_cameras: Callable[..., SolvedCameras] = solve_cameras
     find_region: Callable[..., Region] = find_region
     match_views: Callable[..., StereoResult] = match_solved
-    fit_surface: Callable[..., Surface] = fit_surface
+    fit_surface: Callable[..., Surface] = fit_by_settings
     extract_mesh: Callable[..., SurfaceMesh] = extract_mesh
     build_report: Callable[..., Report] = build_report
 
@@ -196,9 +216,9 @@ def run(job: Job, workspace: Workspace, *, settings: Settings, stages: Stages, l
     if job.until == "cameras":
         files = write_cameras(solved, region, workspace)
         return Outcome(files=files, summary=cameras_summary(solved))
-    inputs = _reconstructed(job, this, settings, stages, placed=(solved, region, device))
+    inputs, radiance = _reconstructed(job, this, settings, stages, placed=(solved, region, device))
     report = this.unkept_stage("report", partial(stages.build_report, inputs, settings.report))
-    return Outcome(files=write_all(report, workspace), summary=summary(report))
+    return Outcome(files=write_all(report, radiance, workspace), summary=summary(report))
 
 
 def _placed(job: Job, this: _Run, settings: Settings, stages: Stages) -> tuple[SolvedCameras, Region]:
@@ -219,8 +239,8 @@ def _reconstructed(
     stages: Stages,
     *,
     placed: tuple[SolvedCameras, Region, torch.device],
-) -> ReportInputs:
-    """The mesh, with all that the report tells of it."""
+) -> tuple[ReportInputs, Radiance | None]:
+    """The mesh, with all that the report tells of it, and the field to render from, where there is one."""
     solved, region, device = placed
     previews = Previews(this.workspace, this.listener.previewed)
     previews.show_cameras(solved, region)
@@ -228,14 +248,15 @@ def _reconstructed(
     stereo = this.stage("stereo", match)
     solved = with_refined(solved, stereo)
     views = solved.views
-    previews.show_points(stereo.points, region)
+    if len(stereo.points.positions):
+        previews.show_points(stereo.points, region)
     chance = {"device": device, "generator": torch.Generator(device).manual_seed(job.seed)}
     show = partial(previews.show_surface, points=stereo.points, region=region)
     fit = partial(stages.fit_surface, views, region, stereo, settings.train, show=show, **chance)
     surface = this.stage("train", fit)
     extract = partial(stages.extract_mesh, views, region, stereo, surface, settings.mesh)
     mesh = this.stage("mesh", extract)
-    return ReportInputs(
+    inputs = ReportInputs(
         job_name=job.output.resolve().name,
         settings=settings,
         seed=job.seed,
@@ -249,6 +270,7 @@ def _reconstructed(
         truth=job.truth,
         versions=_versions(),
     )
+    return inputs, surface.radiance
 
 
 def stage_fingerprints(job: Job, settings: Settings, device_kind: str) -> dict[str, str]:

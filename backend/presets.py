@@ -6,6 +6,7 @@ from types import MappingProxyType
 from .stages.cameras import CamerasConfig
 from .stages.mesh import MeshConfig
 from .stages.photos import PhotosConfig
+from .stages.radiance_fit import RadianceConfig
 from .stages.region import RegionConfig
 from .stages.report import ReportConfig
 from .stages.stereo_config import StereoConfig
@@ -14,13 +15,14 @@ from .stages.train import TrainConfig
 
 @dataclass(frozen=True, kw_only=True)
 class Settings:
-    """One config per stage."""
+    """One config per stage; the type of `train` says what is fitted."""
 
     photos: PhotosConfig = field(default_factory=PhotosConfig)
     cameras: CamerasConfig = field(default_factory=CamerasConfig)
     region: RegionConfig = field(default_factory=RegionConfig)
-    stereo: StereoConfig = field(default_factory=StereoConfig)
-    train: TrainConfig = field(default_factory=TrainConfig)
+    stereo: StereoConfig | None = field(default_factory=StereoConfig)
+    """None where what is fitted does not ask for points."""
+    train: TrainConfig | RadianceConfig = field(default_factory=TrainConfig)
     mesh: MeshConfig = field(default_factory=MeshConfig)
     report: ReportConfig = field(default_factory=ReportConfig)
 
@@ -39,6 +41,7 @@ PRESETS = MappingProxyType(
             train=TrainConfig(levels=(32, 64, 128, 192), rounds=(15, 15, 10, 10), steps=(0, 0, 0, 200)),
             mesh=MeshConfig(max_faces=500_000),
         ),
+        "nerf": Settings(photos=PhotosConfig(max_side_px=800), stereo=None, train=RadianceConfig()),
     }
 )
 """By name; the names are those of backend.wire.protocol.PRESETS."""

@@ -7,8 +7,10 @@ from pathlib import Path
 
 from .maths.sampling import mean_colours
 from .mesh_files import write_glb, write_mesh, write_points, write_sparse
+from .records import save_record
 from .scene import Region, SolvedCameras
 from .stages.nerfstudio import transforms_json
+from .stages.radiance_field import Radiance
 from .stages.report import Report, render_report_html, report_numbers
 from .workspace import LOG, Workspace
 
@@ -16,7 +18,11 @@ Writers = dict[str, Callable[[Path], object]]
 """How each result is written, by its name."""
 
 
-def write_all(report: Report, workspace: Workspace) -> tuple[str, ...]:
+RADIANCE = "radiance.npz"
+"""A radiance field that was fitted, to render from: no pickle, arrays and JSON."""
+
+
+def write_all(report: Report, radiance: Radiance | None, workspace: Workspace) -> tuple[str, ...]:
     """Put all results in place; their names."""
     inputs = report.inputs
     writers: Writers = {
@@ -27,7 +33,9 @@ def write_all(report: Report, workspace: Workspace) -> tuple[str, ...]:
         "report.json": _text(_json(report_numbers(report))),
         "report.html": _text(render_report_html(report)),
     }
-    workspace.write_results(writers)
+    if radiance is not None:
+        writers[RADIANCE] = partial(save_record, record=radiance, hint=Radiance)
+    workspace.write_results(writers, replaced=(RADIANCE,))
     return (*writers, LOG)
 
 

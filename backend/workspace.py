@@ -102,8 +102,13 @@ class Workspace:
             logger.warning("the checkpoint of stage %s is damaged and is redone: %s", stage, error)
             return None
 
-    def write_results(self, writers: dict[str, Callable[[Path], object]]) -> None:
-        """Write every result under another name, then put all in place together."""
+    def write_results(
+        self, writers: dict[str, Callable[[Path], object]], *, replaced: tuple[str, ...] = ()
+    ) -> None:
+        """Write every result under another name, then put all in place together.
+
+        Results of these names that an earlier run left, and this one has not, are removed.
+        """
         parts = self.private / _PARTS
         shutil.rmtree(parts, ignore_errors=True)
         parts.mkdir()
@@ -111,6 +116,8 @@ class Workspace:
             write(parts / name)
         for name in writers:
             (parts / name).replace(self.folder / name)
+        for name in set(replaced) - writers.keys():
+            (self.folder / name).unlink(missing_ok=True)
         parts.rmdir()
 
     def discard_if_nothing_done(self) -> None:

@@ -16,7 +16,7 @@ from ..stages.report import error_numbers
 from ..stages.stereo import StereoResult
 from ..stages.stereo_config import StereoConfig
 from .measuring import Measurement, flat_errors
-from .one_by_one import Placed, extract, fit, match, place
+from .one_by_one import Placed, extract, fit, match, place, surface_configs
 from .suites import Case
 from .summary import Column
 
@@ -79,7 +79,7 @@ COLUMNS = (
 
 def is_random(settings: Settings) -> bool:
     """Whether another seed gives another surface: only rendering draws by lot."""
-    return any(settings.train.steps)
+    return any(surface_configs(settings)[1].steps)
 
 
 def measure_variants(
@@ -101,7 +101,7 @@ def measure_variants(
         for seed in range(num_seeds if is_random(settings) else 1):
             done = partial(Measurement, case=case.name, preset=variant.name, seed=seed, versions={})
             stereo_s: float | None = None
-            key = (settings.stereo, variant.with_masks)
+            key = (surface_configs(settings)[0], variant.with_masks)
             try:
                 if key not in known:
                     known[key], stereo_s = match(shown, settings, device)

@@ -1,19 +1,26 @@
-"""How well a mesh's colours repeat photographs that it was not made from."""
+"""How well a mesh's colours, or a radiance field, repeat photographs that it was not made from."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
+import torch
+from jaxtyping import Bool, Float32
 
 from ..maths.metrics import psnr
 from ..maths.raycast import RayCaster, render_mesh
-from ..scene import SurfaceMesh, View, no_progress
+from ..scene import Camera, SurfaceMesh, View, no_progress
 from ..stages.cameras import CamerasConfig, solve_cameras
 from ..stages.photos import PhotosConfig, load_photos
+from ..stages.radiance_field import Radiance, restored
+from ..stages.radiance_image import radiance_image
 from .suites import Case, image_paths
+
+_Drawn = tuple[Float32[np.ndarray, "height width 3"], Bool[np.ndarray, "height width"]]
+"""Colours, 0 or the background's where nothing is, and what is covered."""
 
 MAX_SIDE_PX = 800
 """Photographs are compared at this size, whatever the preset."""
@@ -50,7 +57,27 @@ def held_out_views(case: Case, folder: Path) -> tuple[View, ...]:
 def held_out_fit(mesh: SurfaceMesh, views: Sequence[View]) -> HeldOutFit:
     """Colours of a mesh (world frame) against at least one view."""
     caster = RayCaster(mesh.vertices, mesh.faces)
-    fits = [_fit(mesh, view, caster) for view in views]
+
+    def draw(camera: Camera) -> _Drawn:
+        image = render_mesh(mesh, camera, caster=caster)
+        return image.colour_srgb, image.coverage
+
+    return _mean_fit(draw, views)
+
+
+def held_out_radiance_fit(radiance: Radiance, views: Sequence[View], device: torch.device) -> HeldOutFit:
+    """The field's own pictures, not its mesh's, against at least one view; half opaque counts as covered."""
+    field = restored(radiance, device)
+
+    def draw(camera: Camera) -> _Drawn:
+        image = radiance_image(field, radiance, camera, device=device, progress=no_progress)
+        return image.colour_srgb, image.opacity > 0.5
+
+    return _mean_fit(draw, views)
+
+
+def _mean_fit(draw: Callable[[Camera], _Drawn], views: Sequence[View]) -> HeldOutFit:
+    fits = [_fit(view, *draw(view.camera)) for view in views]
     finite = [value for value, _ in fits if value is not None and math.isfinite(value)]
     return HeldOutFit(
         psnr_db=sum(finite) / len(finite) if finite else None,
@@ -58,11 +85,12 @@ def held_out_fit(mesh: SurfaceMesh, views: Sequence[View]) -> HeldOutFit:
     )
 
 
-def _fit(mesh: SurfaceMesh, view: View, caster: RayCaster) -> tuple[float | None, float]:
+def _fit(
+    view: View, colour_srgb: Float32[np.ndarray, "height width 3"], coverage: Bool[np.ndarray, "height width"]
+) -> tuple[float | None, float]:
     """PSNR in dB and the share that is covered."""
-    image = render_mesh(mesh, view.camera, caster=caster)
     if view.mask is None:
-        return psnr(view.image_srgb, image.colour_srgb, image.coverage), float(image.coverage.mean())
+        return psnr(view.image_srgb, colour_srgb, coverage), float(coverage.mean())
     inside = np.asarray(view.mask > 0.5)
-    covered = float(image.coverage[inside].mean()) if inside.any() else 0.0
-    return psnr(view.image_srgb, image.colour_srgb, inside), covered
+    covered = float(coverage[inside].mean()) if inside.any() else 0.0
+    return psnr(view.image_srgb, colour_srgb, inside), covered

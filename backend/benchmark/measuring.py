@@ -13,9 +13,13 @@ from typing import Any
 from ..commands.cancelling import CancelRequest
 from ..commands.child import run_child
 from ..errors import ReconstructionError
+from ..machine import choose_device
 from ..mesh_files import read_mesh
+from ..records import load_record
+from ..results import RADIANCE
+from ..stages.radiance_field import Radiance
 from ..wire.client import ROOT, clean_environment
-from .held_out import held_out_fit, held_out_views
+from .held_out import held_out_fit, held_out_radiance_fit, held_out_views
 from .suites import Case, image_paths
 
 _WITH_KNOWN_CAMERAS = ("region", "stereo", "train", "mesh")
@@ -134,5 +138,9 @@ def flat_errors(error: Mapping[str, Any]) -> dict[str, float | None]:
 
 def _held_out_numbers(trial: Trial, output: Path) -> dict[str, float | None]:
     views = held_out_views(trial.case, trial.folder)
-    fit = held_out_fit(read_mesh(output / "mesh.ply"), views)
+    if (output / RADIANCE).is_file():
+        device = choose_device(trial.device)
+        fit = held_out_radiance_fit(load_record(output / RADIANCE, Radiance), views, device)
+    else:
+        fit = held_out_fit(read_mesh(output / "mesh.ply"), views)
     return {"held_out_psnr_db": fit.psnr_db, "held_out_covered_share": fit.covered_share}

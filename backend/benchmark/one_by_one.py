@@ -17,7 +17,8 @@ from ..stages.mesh import extract_mesh
 from ..stages.photos import load_photos
 from ..stages.region import find_region
 from ..stages.stereo import StereoResult, match_views
-from ..stages.train import ShowSurface, Surface, fit_surface, show_nothing
+from ..stages.stereo_config import StereoConfig
+from ..stages.train import ShowSurface, Surface, TrainConfig, fit_surface, show_nothing
 from .suites import Case, image_paths
 
 T = TypeVar("T")
@@ -49,9 +50,17 @@ def place(case: Case, folder: Path, indices: tuple[int, ...], settings: Settings
     return Placed(views=solved.views, region=region)
 
 
+def surface_configs(settings: Settings) -> tuple[StereoConfig, TrainConfig]:
+    """Of stereo and field in settings of the default method. TypeError where they are another's."""
+    if settings.stereo is None or not isinstance(settings.train, TrainConfig):
+        raise TypeError(f"not the settings of a surface from stereo: {settings.train}")
+    return settings.stereo, settings.train
+
+
 def match(placed: Placed, settings: Settings, device: torch.device) -> tuple[StereoResult, float]:
     """Depth maps and points, and the seconds that they took. Raises ReconstructionError."""
-    work = partial(match_views, placed.views, placed.region, settings.stereo, device=device)
+    stereo, _ = surface_configs(settings)
+    work = partial(match_views, placed.views, placed.region, stereo, device=device)
     return _timed(partial(work, progress=no_progress))
 
 
@@ -65,7 +74,8 @@ def fit(
     show: ShowSurface = show_nothing,
 ) -> tuple[Surface, float]:
     """The field, and the seconds that it took. Raises ReconstructionError."""
-    work = partial(fit_surface, placed.views, placed.region, stereo, settings.train, show=show)
+    _, train = surface_configs(settings)
+    work = partial(fit_surface, placed.views, placed.region, stereo, train, show=show)
     generator = torch.Generator(device).manual_seed(seed)
     return _timed(partial(work, device=device, generator=generator, progress=no_progress))
 

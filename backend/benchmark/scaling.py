@@ -11,7 +11,7 @@ from types import MappingProxyType
 from ..machine import choose_device, peak_memory_bytes, set_up_torch
 from ..presets import PRESETS, Settings
 from ..stages.train import Surface
-from .one_by_one import extract, fit, match, place
+from .one_by_one import extract, fit, match, place, surface_configs
 from .suites import Case
 from .summary import Column, markdown
 
@@ -21,6 +21,7 @@ LARGEST_LINEAR = 1.1
 _NUM_VIEWS = 6
 """Where their number is not what changes."""
 _BALANCED = PRESETS["balanced"]
+_STEREO, _TRAIN = surface_configs(_BALANCED)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,7 +44,7 @@ class Cost:
 
 def _of_views(num_views: int) -> Setup:
     # Each is compared with two others whatever their number, so that the work for one view stays the same.
-    stereo = replace(_BALANCED.stereo, num_sources=2)
+    stereo = replace(_STEREO, num_sources=2)
     return Setup(num_views=num_views, settings=replace(_BALANCED, stereo=stereo))
 
 
@@ -53,8 +54,8 @@ def _of_pixels(max_side_px: int) -> Setup:
 
 
 def _of_nodes(nodes: int) -> Setup:
-    levels = (*_BALANCED.train.levels[:-1], nodes)
-    train = replace(_BALANCED.train, levels=levels, steps=(0,) * len(levels))
+    levels = (*_TRAIN.levels[:-1], nodes)
+    train = replace(_TRAIN, levels=levels, steps=(0,) * len(levels))
     return Setup(num_views=_NUM_VIEWS, settings=replace(_BALANCED, train=train))
 
 
@@ -110,7 +111,7 @@ def measure(case: Case, folder: Path, setup: Setup, device_kind: str) -> Cost:
             "stereo_s": stereo_s,
             "train_s": train_s,
             "finest_grid_s": fitted_at_s[-1] - fitted_at_s[-2],
-            "rendering_s": rendering_s if settings.train.steps[-1] else None,
+            "rendering_s": rendering_s if surface_configs(settings)[1].steps[-1] else None,
             "mesh_s": mesh_s,
             "peak_memory_bytes": peak,
             "work_memory_bytes": None if peak is None or held is None else peak - held,

@@ -137,6 +137,12 @@ _PHOTO_CASES = (
     Case(name="statuette_3_masks", folder=_DTU, given=(0, 1, 2), images="image", masks="mask"),
     # Its ring is numbered out of order: these are 23 degrees apart, those held out lie beyond either end.
     Case(name="temple_6", folder=_TEMPLE, given=(0, 5, 6, 7, 8, 9), held_out=(1, 14)),
+    Case(
+        name="temple_14",
+        folder=_TEMPLE,
+        given=(*range(6), 7, *range(9, 16)),
+        held_out=(6, 8),
+    ),
     # 30 degrees apart: between them there is none to hold out, so those beyond either end are.
     Case(name="walnut_3", folder=_WALNUT, given=(0, 1, 2), held_out=(3, 11), truth="reference.ply"),
     Case(name="walnut_6", folder=_WALNUT, given=tuple(range(6)), held_out=(6, 11), truth="reference.ply"),

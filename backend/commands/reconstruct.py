@@ -20,6 +20,7 @@ from .cancelling import EXIT_CANCELLED, CancelRequest, catch_signals, watch_sign
 if TYPE_CHECKING:
     from ..pipeline import Job, Listener, Outcome
     from ..presets import Settings
+    from ..terminal import TerminalListener
 
 EXIT_FINE, EXIT_INTERNAL, EXIT_USER_ERROR = 0, 1, 2
 
@@ -28,6 +29,16 @@ logger = logging.getLogger(__name__)
 
 def on_terminal(job: protocol.Job) -> int:
     """Run the job with progress on stderr and the names of the results on stdout; the exit code."""
+    return with_terminal(
+        lambda listener: listener.finished(Path(job.output), run_job(_checked(job), Path(), listener)),
+        cancelled=lambda listener: listener.cancelled(),
+    )
+
+
+def with_terminal(
+    work: Callable[["TerminalListener"], None], *, cancelled: Callable[["TerminalListener"], None]
+) -> int:
+    """Do the work before a person's eyes, who may stop it; the exit code."""
     try:
         from ..terminal import terminal_listener  # here, because rich may be missing
     except ImportError as error:
@@ -37,11 +48,7 @@ def on_terminal(job: protocol.Job) -> int:
     request = CancelRequest()
     with terminal_listener(request) as listener:
         watch_signals(request, listener.stopping)
-        return settle(
-            lambda: listener.finished(Path(job.output), run_job(_checked(job), Path(), listener)),
-            failed=listener.failed,
-            cancelled=listener.cancelled,
-        )
+        return settle(lambda: work(listener), failed=listener.failed, cancelled=lambda: cancelled(listener))
 
 
 def on_wire(job_path: Path) -> int:

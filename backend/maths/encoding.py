@@ -23,3 +23,13 @@ def positional_encoding(
     half_turns = x[..., None, :] * scale[:, None]
     phase = math.pi * (half_turns - 2 * (half_turns / 2).round()).flatten(start_dim=-2)
     return torch.cat([phase.sin(), phase.cos()], dim=-1)
+
+
+def wave_window(frequencies: int, coordinates: int, active: float) -> Float[Tensor, "features"]:
+    """Weights for `positional_encoding` that let `active` of the frequencies count, the lowest first.
+
+    Linear between whole numbers. Coarse before fine, as in BARF (Lin et al., arXiv:2104.06405, eq. 14) and,
+    for few photographs, FreeNeRF (Yang et al., arXiv:2303.07418): high waves fit pixels before a shape.
+    """
+    weight = (active - torch.arange(frequencies)).clamp(0, 1)
+    return weight.repeat_interleave(coordinates).repeat(2)

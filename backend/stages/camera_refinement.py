@@ -22,7 +22,7 @@ from ..maths.geometry import Pinhole, inside, pinhole_in_object, project, sample
 from ..maths.patch_alignment import align, beside_epipolar_lines_px, on_planes, patch_pixels
 from ..scene import Camera, Decision, Progress, Region, SolvedCameras, SurfacePoints, View, transform_points
 from .lenses import rigid_matrix
-from .stereo import StereoResult, match_views
+from .stereo import StereoResult, match_views, unmatched
 from .stereo_config import StereoConfig
 from .stereo_windows import neighbours
 
@@ -87,12 +87,20 @@ class Refined:
 
 
 def match_solved(
-    solved: SolvedCameras, region: Region, config: StereoConfig, *, device: torch.device, progress: Progress
+    solved: SolvedCameras,
+    region: Region,
+    config: StereoConfig | None,
+    *,
+    device: torch.device,
+    progress: Progress,
 ) -> StereoResult:
     """Stereo of the photographs; where their cameras were estimated and turn out to be off, once more.
 
-    Given cameras are taken at their word. Raises what `match_views` does.
+    Given cameras are taken at their word. Without a config nothing is compared: what is fitted does not ask.
+    Raises what `match_views` does.
     """
+    if config is None:
+        return unmatched(solved.views)
     work = partial(match_views, region=region, config=config, device=device)
     if not solved.estimated:
         return work(solved.views, progress=progress)

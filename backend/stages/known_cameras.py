@@ -1,5 +1,6 @@
 """Cameras that are given: nerfstudio's transforms.json, or a COLMAP model, matched to the photographs."""
 
+import typing
 from collections.abc import Mapping, Sequence
 from pathlib import Path, PurePosixPath
 
@@ -10,12 +11,15 @@ from jaxtyping import Float64
 
 from ..errors import ErrorCode, ReconstructionError
 from ..images import same_shape
-from ..scene import Photo, Unplaced
-from .lenses import PlacedPhoto, Placement, rigid_matrix, sparse_points
+from ..scene import Camera, Photo, Unplaced
+from .lenses import PlacedPhoto, Placement, rigid_matrix, sparse_points, undistorted_view
 from .nerfstudio import camera_from_world, frame_lens, read_frames
 
 _ROTATION_TOLERANCE = 5e-3
 """Poses are often written with few digits; nearer than this they are made exact."""
+
+LARGEST_SIDE_PX = 20_000
+"""Of a picture to render: 400 million pixels are a slip of the pen."""
 
 _CHECK = "Check that the cameras belong to these photographs."
 
@@ -28,6 +32,51 @@ def read_placement(photos: Sequence[Photo], given: Path) -> Placement:
     """
     source = _find_source(given)
     return _from_model(photos, source) if source.is_dir() else _from_transforms(photos, source)
+
+
+def read_cameras(given: Path) -> tuple[tuple[str, Camera], ...]:
+    """Names and pinhole cameras of a transforms.json or a COLMAP model, without any photographs.
+
+    A lens that bends light gives the pinhole camera that its photograph would have been undistorted to. The
+    file has to tell the pictures' sizes. Raises ReconstructionError(CAMERAS_UNUSABLE).
+    """
+    source = _find_source(given)
+    blanks = _blanks_of_model(source) if source.is_dir() else _blanks_of_transforms(source)
+    placed = read_placement(blanks, given).placed
+    return tuple((blanks[one.index].name, undistorted_view(blanks[one.index], one).camera) for one in placed)
+
+
+def _blanks_of_transforms(path: Path) -> tuple[Photo, ...]:
+    """Photographs as the file tells of them, with nothing on them."""
+    blanks = []
+    for frame in read_frames(path):
+        name, sides = str(frame["file_path"]), (frame.get("w"), frame.get("h"))
+        if not all(isinstance(side, int | float) and 1 <= side <= LARGEST_SIDE_PX for side in sides):
+            text = f"{path.name} does not tell how large the picture {name} is."
+            raise _unusable(text, "Add its width and height in pixels as w and h.")
+        width, height = (round(typing.cast(float, side)) for side in sides)
+        blanks.append(_blank(name, width, height))
+    return tuple(blanks)
+
+
+def _blanks_of_model(folder: Path) -> tuple[Photo, ...]:
+    model = _model(folder)
+    images = [model.images[number] for number in sorted(model.reg_image_ids())]
+    lenses = [model.cameras[image.camera_id] for image in images]
+    pairs = zip(images, lenses, strict=True)
+    return tuple(_blank(image.name, lens.width, lens.height) for image, lens in pairs)
+
+
+def _blank(name: str, width: int, height: int) -> Photo:
+    return Photo(
+        name=name,
+        path=Path(name),
+        image_srgb=np.broadcast_to(np.float32(0), (height, width, 3)),
+        mask=None,
+        original_width=width,
+        original_height=height,
+        focal_px=None,
+    )
 
 
 def match_by_name(photo_paths: Sequence[str], camera_paths: Sequence[str]) -> dict[int, int]:
@@ -105,13 +154,17 @@ def _from_transforms(photos: Sequence[Photo], path: Path) -> Placement:
     )
 
 
-def _from_model(photos: Sequence[Photo], folder: Path) -> Placement:
+def _model(folder: Path) -> pycolmap.Reconstruction:
     try:
-        model = pycolmap.Reconstruction(folder)
+        return pycolmap.Reconstruction(folder)
     except (ValueError, RuntimeError, IndexError) as error:
         raise _unusable(
             f"The COLMAP model in {folder} cannot be read ({error}).", "Export it again."
         ) from error
+
+
+def _from_model(photos: Sequence[Photo], folder: Path) -> Placement:
+    model = _model(folder)
     image_ids = sorted(model.reg_image_ids())
     matched = _matched(photos, [model.images[i].name for i in image_ids], folder)
     placed, ids = [], []

@@ -75,7 +75,7 @@ def extract_mesh(
     seen = visible_from(vertices, normals, [view.camera for view in views], RayCaster(vertices, faces))
     support = support_of(vertices, seen, points, stereo.points.confidence, cell)
     kept = in_seen_pieces(faces, seen)
-    if all(view.mask is None for view in views):
+    if len(points) and all(view.mask is None for view in views):
         measured_scene, decision = _open_or_closed(vertices, faces, support, stereo.depth_maps, cell)
         kept &= measured_scene
         decisions = (decision,)
@@ -226,6 +226,9 @@ def support_of(
     cell: float,
 ) -> Float32[np.ndarray, "vertices"]:
     """How well photographs back every vertex, 0 to 1 (see the module's first lines)."""
+    looked_at = -np.expm1(-seen.sum(axis=1).astype(np.float64))
+    if not len(points):
+        return np.asarray(0.3 * looked_at, np.float32)
     # beyond, the bell is less than 1e-10; a search without a bound is slow where no point is near
     distance, nearest = cKDTree(points).query(
         vertices, k=min(8, len(points)), distance_upper_bound=7.5 * cell, workers=-1
@@ -233,7 +236,6 @@ def support_of(
     near = np.exp(-((np.atleast_2d(distance.T).T / (1.5 * cell)) ** 2))
     near *= np.append(confidence, 0.0)[np.atleast_2d(nearest.T).T]  # the last for those that found none
     measured = -np.expm1(-near.sum(axis=1))
-    looked_at = -np.expm1(-seen.sum(axis=1).astype(np.float64))
     return np.asarray(0.7 * measured + 0.3 * looked_at, np.float32)
 
 

@@ -69,6 +69,22 @@ def match_views(
     return StereoResult(points=points, depth_maps=tuple(full_size))
 
 
+def unmatched(views: tuple[View, ...]) -> StereoResult:
+    """What stereo gives where it was not asked: no points, and depth maps in which nothing was measured."""
+    none, nothing = np.zeros((0, 3), np.float32), np.zeros(0, np.int64)
+    points = SurfacePoints(
+        positions=none,
+        normals=none,
+        colours_srgb=none,
+        confidence=none[:, 0],
+        num_views=nothing,
+        view_index=nothing,
+    )
+    blanks = (np.zeros((view.camera.height, view.camera.width), np.float32) for view in views)
+    maps = (DepthMap(depth=blank, confidence=blank, empty=None, subject=None) for blank in blanks)
+    return StereoResult(points=points, depth_maps=tuple(maps))
+
+
 def _check_enough(points: SurfacePoints) -> None:
     if len(points.positions) < 100:
         raise ReconstructionError(

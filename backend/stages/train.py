@@ -20,6 +20,7 @@ from ..scene import Decision, Progress, Region, View, to_unit_sphere, within
 from .deadline import Clock, GridCost, deadline_after, finest_grid, predicted_s
 from .linear_fit import LinearConfig, fit_level, start
 from .measurements import Measurements, measurements
+from .radiance_field import Radiance
 from .render_fit import RenderConfig, refine
 from .silhouettes import least_distance, missing, silhouette_rays
 from .stereo import StereoResult
@@ -58,6 +59,8 @@ class Surface:
     """Signed, on nodes over the cube [-1, 1]^3 of the grid frame and in its units; > 0 outside."""
     grid_from_world: Float64[np.ndarray, "4 4"]
     """A similarity: the cube is laid tightly around the surface."""
+    radiance: Radiance | None = None
+    """The field to render from, where one was fitted."""
     decisions: tuple[Decision, ...] = ()
 
 

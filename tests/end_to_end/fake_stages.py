@@ -45,6 +45,7 @@ class FakeStereo:
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class FakeSurface:
     values: np.ndarray
+    radiance: None = None
 
 
 def fail(error: Exception) -> None:

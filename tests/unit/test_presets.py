@@ -8,8 +8,10 @@ from pathlib import Path
 import pytest
 
 from backend.doctor import DEPENDENCIES
+from backend.pipeline import FITS
 from backend.presets import PRESETS, Settings
 from backend.stages.report import flat_settings
+from backend.stages.train import TrainConfig
 from backend.version import VERSION
 from backend.wire import protocol
 
@@ -27,15 +29,23 @@ def test_presets_differ_from_each_other() -> None:
 
 def test_more_detail_means_larger_pictures_finer_grids_and_more_faces() -> None:
     def effort(settings: Settings) -> tuple[int, int, int]:
+        assert isinstance(settings.train, TrainConfig)
         return settings.photos.max_side_px, max(settings.train.levels), settings.mesh.max_faces
 
     fast, balanced, detailed = (effort(PRESETS[name]) for name in ("fast", "balanced", "detailed"))
     assert all(a < b < c for a, b, c in zip(fast, balanced, detailed, strict=True))
 
 
-@pytest.mark.parametrize("name", PRESETS)
+OF_SURFACES = {name: train for name in PRESETS if isinstance(train := PRESETS[name].train, TrainConfig)}
+
+
+def test_every_preset_can_be_fitted() -> None:
+    assert {type(preset.train) for preset in PRESETS.values()} == set(FITS)
+
+
+@pytest.mark.parametrize("name", OF_SURFACES)
 def test_each_level_of_a_preset_has_its_steps(name: str) -> None:
-    train = PRESETS[name].train
+    train = OF_SURFACES[name]
     assert len(train.levels) == len(train.steps) == len(train.rounds)
     assert list(train.levels) == sorted(set(train.levels))
 
@@ -47,7 +57,9 @@ def attributes_read() -> set[str]:
     return {node.attr for node in nodes if isinstance(node, ast.Attribute)}
 
 
-@pytest.mark.parametrize("name", [name for name, _ in flat_settings(Settings())])
+@pytest.mark.parametrize(
+    "name", sorted({name for preset in PRESETS.values() for name, _ in flat_settings(preset) if "." in name})
+)
 def test_every_setting_is_read_by_a_stage(name: str) -> None:
     assert name.rpartition(".")[2] in attributes_read()
 
