@@ -198,7 +198,7 @@ class FEWVIEW_PT_reconstruct(_Step, bpy.types.Panel):
         """Preset and start."""
         layout, settings = self.layout, settings_of(context)
         draw_state(layout, self.state(context))
-        layout.row().prop(settings, "preset", expand=True)
+        layout.prop(settings, "preset")
         ready = self.state(context).icon != TODO
         row = layout.row()
         row.enabled = ready

@@ -176,6 +176,8 @@ class FEWVIEW_PG_settings(bpy.types.PropertyGroup):
             ("balanced", "Balanced", "Good for most subjects"),
             ("detailed", "Detailed", "Fine structures, for sharp and large photographs"),
             ("nerf", "NeRF", "For comparison: a radiance field, slow and with a rougher mesh"),
+            ("neus", "NeuS", "For comparison: a network of distance learned by rendering alone, slow"),
+            ("sparsecraft", "SparseCraft", "For comparison: the same with a hash grid and points, slow"),
         ],
         default="balanced",
     )

@@ -28,6 +28,7 @@ from .scene import Decision, Photo, Region, SolvedCameras, SurfaceMesh, View
 from .stages.camera_refinement import match_solved, with_refined
 from .stages.cameras import solve_cameras
 from .stages.mesh import extract_mesh
+from .stages.neus_fit import NeusConfig, fit_neus
 from .stages.photos import load_photos
 from .stages.radiance_field import Radiance
 from .stages.radiance_fit import RadianceConfig, fit_radiance
@@ -70,7 +71,7 @@ class Job:
 
 
 FITS: typing.Mapping[type, Callable[..., Surface]] = MappingProxyType(
-    {TrainConfig: fit_surface, RadianceConfig: fit_radiance}
+    {TrainConfig: fit_surface, RadianceConfig: fit_radiance, NeusConfig: fit_neus}
 )
 """What is fitted, by the type of its settings."""
 
@@ -79,7 +80,7 @@ def fit_by_settings(
     views: tuple[View, ...],
     region: Region,
     stereo: StereoResult,
-    config: TrainConfig | RadianceConfig,
+    config: TrainConfig | RadianceConfig | NeusConfig,
     **keywords: typing.Any,
 ) -> Surface:
     """The surface as the type of the settings asks for it; each of FITS has the same arguments."""

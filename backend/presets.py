@@ -5,6 +5,9 @@ from types import MappingProxyType
 
 from .stages.cameras import CamerasConfig
 from .stages.mesh import MeshConfig
+from .stages.networks import HashConfig, NetworkConfig
+from .stages.neus_fit import NeusConfig
+from .stages.neus_losses import Sampling, Weights
 from .stages.photos import PhotosConfig
 from .stages.radiance_fit import RadianceConfig
 from .stages.region import RegionConfig
@@ -22,7 +25,7 @@ class Settings:
     region: RegionConfig = field(default_factory=RegionConfig)
     stereo: StereoConfig | None = field(default_factory=StereoConfig)
     """None where what is fitted does not ask for points."""
-    train: TrainConfig | RadianceConfig = field(default_factory=TrainConfig)
+    train: TrainConfig | RadianceConfig | NeusConfig = field(default_factory=TrainConfig)
     mesh: MeshConfig = field(default_factory=MeshConfig)
     report: ReportConfig = field(default_factory=ReportConfig)
 
@@ -42,6 +45,20 @@ PRESETS = MappingProxyType(
             mesh=MeshConfig(max_faces=500_000),
         ),
         "nerf": Settings(photos=PhotosConfig(max_side_px=800), stereo=None, train=RadianceConfig()),
+        "neus": Settings(photos=PhotosConfig(max_side_px=800), stereo=None, train=NeusConfig()),
+        "sparsecraft": Settings(
+            photos=PhotosConfig(max_side_px=800),
+            train=NeusConfig(
+                network=NetworkConfig(
+                    layers=1, colour_layers=3, hash_grid=HashConfig(), albedo_and_specular=True
+                ),
+                sampling=Sampling(rays=128, uniform=16, rounds=2),
+                weights=Weights(points=1.0),
+                learning_rate=1e-2,
+                constant=0.5,
+                slope_annealed_at=1.0,
+            ),
+        ),
     }
 )
 """By name; the names are those of backend.wire.protocol.PRESETS."""

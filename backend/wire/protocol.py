@@ -18,7 +18,7 @@ PROTOCOL_VERSION = 1
 HEARTBEAT_S = 4.0
 """Longest silence of a healthy backend; the promise to the caller is 5 s."""
 
-PRESETS = ("fast", "balanced", "detailed", "nerf")
+PRESETS = ("fast", "balanced", "detailed", "nerf", "neus", "sparsecraft")
 DEVICES = ("auto", "cpu", "cuda", "mps")
 UNTIL = ("cameras", "report")
 LARGEST_SEED = 2**31 - 1
