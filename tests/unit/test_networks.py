@@ -98,11 +98,15 @@ def test_split_colour_is_albedo_and_a_grey_gloss() -> None:
 
 def test_levels_that_are_not_active_change_nothing() -> None:
     surface, points = made(NetworkConfig(hash_grid=HASHED)), in_unit_ball(50)
+    with torch.no_grad():
+        for layer in surface.distance_network.hidden:
+            layer.direction.add_(0.1)  # which at the start are deaf to the encoding
     before = surface.distance(points, 2)[0]
     with torch.no_grad():
         for table in surface.tables[2:]:
             table.fill_(1.0)
     assert torch.equal(surface.distance(points, 2)[0], before)
+    assert not torch.equal(surface.distance(points, 4)[0], before)
 
 
 @pytest.mark.parametrize("config", SHAPES[:2])
