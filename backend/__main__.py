@@ -104,7 +104,7 @@ def _parser() -> argparse.ArgumentParser:
         "--cameras", metavar="FILE_OR_FOLDER", help="transforms.json or COLMAP model; else they are estimated"
     )
     add("--masks", metavar="FOLDER", help="an image per photograph, white on the subject")
-    add("--preset", choices=PRESETS, help="speed against detail (balanced)")
+    add("--preset", choices=PRESETS, help="speed against detail (balanced); nerf: a radiance field")
     add("--device", choices=DEVICES, help="where to compute (auto: the fastest there is)")
     add("--seed", type=_seed, metavar="N", help="of all chance (0)")
     add("--truth", metavar="MESH", help="true mesh to measure the result against")

@@ -4,12 +4,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 import trimesh
 
-from backend.benchmark.held_out import held_out_fit, held_out_views
+from backend.benchmark.held_out import held_out_fit, held_out_radiance_fit, held_out_views
 from backend.benchmark.suites import Case
 from backend.maths.raycast import render_mesh
-from backend.scene import Camera, SurfaceMesh, View
+from backend.scene import Camera, Region, SurfaceMesh, View
+from backend.stages.radiance_field import RadianceField, RadianceShape, kept
 from tests.synthetic_scene import photographed, ring_cameras, write_scene
 
 GREY = 102
@@ -86,3 +88,19 @@ def test_the_views_are_those_that_are_held_out(tmp_path: Path) -> None:
             view.camera.camera_from_world, scene.cameras[index].camera_from_world, atol=1e-9
         )
         assert view.mask is not None
+
+
+def test_a_radiance_field_is_measured_by_its_own_pictures() -> None:
+    """Opaque and black in the unit sphere: 20 dB from a photograph of brightness 0.1."""
+    field = RadianceField(RadianceShape(width=8, layers=1), torch.Generator().manual_seed(0))
+    with torch.no_grad():
+        field.density_head[0].bias.fill_(100.0)
+        field.colour_head[-1].bias.fill_(-100.0)
+    radiance = kept(field, Region(object_from_world=np.eye(4)), None)
+    fit = held_out_radiance_fit(radiance, [view_of(0.1, None)], torch.device("cpu"))
+    assert fit.psnr_db == pytest.approx(20.0, abs=1e-3)
+    assert fit.covered_share == pytest.approx(coverage().mean(), rel=0.05)
+    masked = held_out_radiance_fit(
+        radiance, [view_of(0.1, coverage().astype(np.float32))], torch.device("cpu")
+    )
+    assert masked.covered_share > 0.98

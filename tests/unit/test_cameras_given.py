@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from backend.errors import ErrorCode, ReconstructionError
 from backend.scene import Photo, Region, SolvedCameras, Unplaced, no_progress, to_unit_sphere
 from backend.stages.cameras import CamerasConfig, solve_cameras
-from backend.stages.known_cameras import checked_pose, match_by_name
+from backend.stages.known_cameras import checked_pose, match_by_name, read_cameras
 from backend.stages.nerfstudio import OPENCV_FROM_OPENGL, frame_lens, transforms_json
 
 WIDTH, HEIGHT = 64, 48
@@ -121,6 +121,33 @@ def test_cameras_given_back_make_the_same_views(model: str, tmp_path: Path) -> N
         )
         np.testing.assert_array_equal(other.camera.intrinsics, view.camera.intrinsics)
         np.testing.assert_array_equal(other.image_srgb, view.image_srgb)
+
+
+@pytest.mark.parametrize("model", LENSES)
+def test_without_photographs_cameras_are_read_as_with_them(model: str, tmp_path: Path) -> None:
+    """From a COLMAP model and from a transforms.json, of photographs as large as they say."""
+    blank = np.zeros((120, 160, 3), np.float32)
+    sizes = {"image_srgb": blank, "original_width": 160, "original_height": 120}
+    solved = solve([replace(photo, **sizes) for photo in PHOTOS], colmap_model(tmp_path, model), tmp_path)
+    path = tmp_path / "transforms.json"
+    path.write_text(json.dumps(transforms_json(solved, REGION)))
+    for given in (tmp_path / "colmap", path):
+        cameras = read_cameras(given)
+        assert [name for name, _ in cameras] == [view.name for view in solved.views]
+        for (_, camera), view in zip(cameras, solved.views, strict=True):
+            np.testing.assert_allclose(camera.camera_from_world, view.camera.camera_from_world, atol=1e-12)
+            np.testing.assert_allclose(camera.intrinsics, view.camera.intrinsics, rtol=1e-12)
+            assert (camera.width, camera.height) == (160, 120)
+
+
+@pytest.mark.parametrize("sides", [{"w": None}, {"h": "48"}, {"w": 0}, {"w": 1e9}])
+def test_without_photographs_the_file_has_to_tell_their_size(sides: dict[str, Any], tmp_path: Path) -> None:
+    path = tmp_path / "transforms.json"
+    path.write_text(json.dumps({"frames": [make_frame("a.jpg", **sides)]}))
+    with pytest.raises(ReconstructionError) as caught:
+        read_cameras(path)
+    assert caught.value.code == ErrorCode.CAMERAS_UNUSABLE
+    assert "images/a.jpg" in caught.value.text
 
 
 @pytest.mark.parametrize("model", LENSES)

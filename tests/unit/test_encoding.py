@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from backend.maths.encoding import positional_encoding
+from backend.maths.encoding import positional_encoding, wave_window
 
 FREQUENCIES = 20
 
@@ -51,3 +51,12 @@ def test_values_lie_between_minus_one_and_one(x: float) -> None:
     encoded = positional_encoding(torch.full((1, 3), x), 10)
     assert encoded.abs().max() <= 1
     torch.testing.assert_close(encoded[:, :30].square() + encoded[:, 30:].square(), torch.ones(1, 30))
+
+
+def test_waves_open_from_the_longest_on() -> None:
+    """Two and a half of four: for both coordinates, sines and cosines, in the order of the encoding."""
+    expected = torch.tensor([1.0, 1, 1, 1, 0.5, 0.5, 0, 0]).repeat(2)
+    torch.testing.assert_close(wave_window(4, 2, 2.5), expected)
+    encoded = positional_encoding(torch.tensor([[0.3, 0.3]]), 4)
+    assert len(wave_window(4, 2, 4.0)) == encoded.shape[1]
+    assert (wave_window(4, 2, 4.0) == 1).all()

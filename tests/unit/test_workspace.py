@@ -255,6 +255,15 @@ def test_results_appear_together_or_not_at_all(tmp_path: Path) -> None:
         assert [(workspace.folder / name).read_text() for name in "ab"] == ["new a", "new b"]
 
 
+def test_what_an_earlier_run_left_and_this_one_has_not_is_removed(tmp_path: Path) -> None:
+    with open_workspace(tmp_path / "out") as workspace:
+        workspace.write_results({"a": write_text("old a"), "b": write_text("old b")}, replaced=("b",))
+        assert (workspace.folder / "b").read_text() == "old b"
+        workspace.write_results({"a": write_text("new a")}, replaced=("b", "never"))
+        assert not (workspace.folder / "b").exists()
+        assert (workspace.folder / "a").read_text() == "new a"
+
+
 def test_a_run_that_did_nothing_leaves_nothing(tmp_path: Path) -> None:
     with open_workspace(tmp_path / "out") as workspace:
         workspace.log_path.write_text("log")

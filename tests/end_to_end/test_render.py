@@ -1,0 +1,211 @@
+"""A finished job rendered from given cameras: as a program, and what it refuses."""
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from backend.errors import Cancelled, ErrorCode, ReconstructionError
+from backend.maths.raycast import render_mesh
+from backend.mesh_files import read_mesh, write_mesh
+from backend.records import save_record
+from backend.rendering import render_job
+from backend.results import RADIANCE
+from backend.scene import SurfaceMesh, no_progress
+from backend.stages.radiance_field import Radiance, RadianceField, RadianceShape, kept, restored
+from backend.stages.radiance_image import radiance_image
+from backend.wire.client import clean_environment
+from tests.synthetic_scene import (
+    Scene,
+    photographed,
+    ring_cameras,
+    texture_srgb,
+    true_mesh,
+    true_region,
+    write_scene,
+)
+
+ROOT = Path(__file__).resolve().parents[2]
+SHAPE = RadianceShape(width=16, layers=2, proposal_width=8, proposal_intervals=8, intervals=6)
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    return photographed(ring_cameras(3, 40))
+
+
+@pytest.fixture
+def folder(scene: Scene, tmp_path: Path) -> Iterator[Path]:
+    """With images/transforms.json, a job with a radiance field in `nerf`, one with a mesh in `surface`."""
+    write_scene(scene, tmp_path)
+    for image in (tmp_path / "images").glob("*.png"):
+        image.unlink()
+    (tmp_path / "nerf").mkdir()
+    save_record(tmp_path / "nerf" / RADIANCE, radiance(), Radiance)
+    (tmp_path / "surface").mkdir()
+    body = true_mesh()
+    mesh = SurfaceMesh(
+        vertices=np.asarray(body.vertices),
+        faces=np.asarray(body.faces, np.int64),
+        normals=np.asarray(body.vertex_normals, np.float32),
+        colours_srgb=np.round(255 * texture_srgb(np.asarray(body.vertices))).astype(np.uint8),
+        support=np.ones(len(body.vertices), np.float32),
+    )
+    write_mesh(tmp_path / "surface" / "mesh.ply", mesh)
+    deterministic = torch.are_deterministic_algorithms_enabled()
+    yield tmp_path
+    torch.use_deterministic_algorithms(deterministic)
+    torch.set_flush_denormal(False)
+
+
+def radiance() -> Radiance:
+    return kept(RadianceField(SHAPE, torch.Generator().manual_seed(0)), true_region(), None)
+
+
+def rendered(folder: Path, job: str, output: str = "pictures") -> tuple[str, ...]:
+    cameras = folder / "images" / "transforms.json"
+    return render_job(folder / job, cameras, folder / output, "cpu", no_progress)
+
+
+def program(
+    command: str, subject: Path, folder: Path, *more: str, output: Path
+) -> "subprocess.CompletedProcess[str]":
+    """The command as a user starts it, with the folder's cameras."""
+    options = ["--cameras", str(folder / "images" / "transforms.json"), "--output", str(output)]
+    result = subprocess.run(
+        [sys.executable, "-m", "backend", command, str(subject), *options, "--device", "cpu", *more],
+        cwd=ROOT,
+        env={**clean_environment(os.environ), "OMP_NUM_THREADS": "1"},
+        timeout=300,
+        check=False,
+        capture_output=True,
+        text=True,
+    )
+    assert result.returncode == 0, result.stderr
+    return result
+
+
+def pixels(path: Path) -> np.ndarray:
+    with Image.open(path) as file:
+        return np.asarray(file).astype(int)
+
+
+def refusal(folder: Path, job: str = "nerf", output: str = "pictures") -> ReconstructionError:
+    with pytest.raises(ReconstructionError) as found:
+        rendered(folder, job, output)
+    return found.value
+
+
+def test_the_program_renders_a_radiance_field(folder: Path, scene: Scene) -> None:
+    """No photograph is there, only the cameras."""
+    result = program("render", folder / "nerf", folder, output=folder / "pictures")
+    names = [f"view_{index:02d}.png" for index in range(3)]
+    assert result.stdout.split() == [str(folder / "pictures" / name) for name in names]
+    assert "[1/1] render done" in result.stderr
+    field, device = restored(radiance(), torch.device("cpu")), torch.device("cpu")
+    for name, camera in zip(names, scene.cameras, strict=True):
+        image = radiance_image(field, radiance(), camera, device=device, progress=no_progress)
+        found = pixels(folder / "pictures" / name)
+        assert found.shape == (camera.height, camera.width, 4)
+        np.testing.assert_allclose(found[..., 3], 255 * image.opacity, atol=0.51)
+        seen = found[..., 3] > 127
+        assert seen.any()
+        before_black = found[..., :3] / 255 * image.opacity[..., None]
+        np.testing.assert_allclose(before_black[seen], image.colour_srgb[seen], atol=4 / 255)
+
+
+def test_a_learned_background_is_in_the_picture(folder: Path) -> None:
+    green = replace(radiance(), background_srgb=np.array([0, 1, 0], np.float32))
+    save_record(folder / "nerf" / RADIANCE, green, Radiance)
+    rendered(folder, "nerf")
+    found = pixels(folder / "pictures" / "view_00.png")
+    assert found.shape[2] == 3
+    assert found[0, 0].tolist() == [0, 255, 0]
+
+
+def test_a_job_without_a_field_gives_pictures_of_its_mesh(folder: Path, scene: Scene) -> None:
+    assert rendered(folder, "surface") == ("view_00.png", "view_01.png", "view_02.png")
+    found = pixels(folder / "pictures" / "view_01.png")
+    expected = render_mesh(read_mesh(folder / "surface" / "mesh.ply"), scene.cameras[1])
+    assert ((found[..., 3] == 255) == expected.coverage).all()
+    np.testing.assert_allclose(found[..., :3], 255 * expected.colour_srgb, atol=0.51)
+
+
+def test_rendered_again_the_pictures_are_replaced_but_strangers_are_left_alone(folder: Path) -> None:
+    rendered(folder, "surface")
+    before = pixels(folder / "pictures" / "view_00.png")
+    rendered(folder, "nerf")
+    assert (pixels(folder / "pictures" / "view_00.png") != before).any()
+    (folder / "strange").mkdir()
+    (folder / "strange" / "letter.txt").write_text("mine")
+    error = refusal(folder, output="strange")
+    assert error.code is ErrorCode.OUTPUT_UNUSABLE
+    assert [path.name for path in (folder / "strange").iterdir()] == ["letter.txt"]
+
+
+def test_a_job_s_own_folder_gets_no_pictures(folder: Path) -> None:
+    (folder / "nerf" / "cameras.json").write_text("{}")
+    error = refusal(folder, output="nerf")
+    assert error.code is ErrorCode.OUTPUT_UNUSABLE
+    assert "results of a reconstruction" in error.text
+
+
+def test_what_is_no_job_is_told(folder: Path) -> None:
+    error = refusal(folder, job="images")
+    assert error.code is ErrorCode.SETTINGS_INVALID
+    assert "neither radiance.npz nor mesh.ply" in error.text
+    (folder / "nerf" / RADIANCE).write_bytes(b"PK damaged")
+    assert "cannot be read" in refusal(folder).text
+    (folder / "surface" / "mesh.ply").write_bytes(b"ply damaged")
+    assert "cannot be read" in refusal(folder, job="surface").text
+    assert not (folder / "pictures").exists()
+
+
+def test_two_frames_of_one_name_are_refused(folder: Path) -> None:
+    path = folder / "images" / "transforms.json"
+    content = json.loads(path.read_text())
+    content["frames"][1]["file_path"] = "elsewhere/view_00.png"
+    path.write_text(json.dumps(content))
+    error = refusal(folder)
+    assert error.code is ErrorCode.CAMERAS_UNUSABLE
+    assert "view_00.png" in error.text
+
+
+def test_stopped_nothing_is_left(folder: Path) -> None:
+    told: list[float] = []
+
+    def listen(fraction: float, _text: str) -> None:
+        told.append(fraction)
+        if fraction > 0.3:
+            raise Cancelled
+
+    with pytest.raises(Cancelled):
+        render_job(folder / "nerf", folder / "images" / "transforms.json", folder / "pictures", "cpu", listen)
+    assert told == sorted(told)
+    assert not (folder / "pictures").exists()
+
+
+@pytest.mark.slow
+def test_from_photographs_to_a_field_and_from_it_to_pictures(tmp_path: Path) -> None:
+    """In two seconds of fitting little is learned, but all is there, and a second run takes it up."""
+    write_scene(photographed(ring_cameras(6, 48)), tmp_path)
+    words = ("--preset", "nerf", "--budget-seconds", "2")
+    first = program("reconstruct", tmp_path / "images", tmp_path, *words, output=tmp_path / "job")
+    assert str(tmp_path / "job" / RADIANCE) in first.stdout.split()
+    report = json.loads((tmp_path / "job" / "report.json").read_text())
+    assert report["num_stereo_points"] == 0
+    said = {decision["what"]: decision["because"] for decision in report["decisions"]}
+    assert said["field"] == "2 s given"
+    assert "a density has no surface of its own" in said["surface"]
+    again = program("reconstruct", tmp_path / "images", tmp_path, *words, output=tmp_path / "job")
+    assert "Resuming: photos, cameras, region, stereo, train, mesh are done" in again.stderr
+    program("render", tmp_path / "job", tmp_path, output=tmp_path / "pictures")
+    assert pixels(tmp_path / "pictures" / "view_05.png").shape == (36, 48, 4)
