@@ -77,7 +77,7 @@ def cases(data: Path, names: list[str]) -> list[Case]:
             made.append(
                 Case(name=f"{name}, 1024, {noise:g} %", cloud=sparse, normals_known=False, truth=truth)
             )
-    return made
+    return sorted(made, key=lambda case: len(case.cloud.positions))  # the quick ones first
 
 
 def _drawn(truth: TrueSurface, noise_percent: float) -> np.ndarray:

@@ -57,8 +57,10 @@ class PointFitConfig:
     """Along each axis of the finest grid."""
     most_points: int = 200_000
     """Of more, so many are drawn."""
-    sides: NetworkConfig = field(default_factory=lambda: NetworkConfig(steps=300, batch=1000))
-    """`linear`: of the run that finds the sides."""
+    sides: NetworkConfig = field(
+        default_factory=lambda: NetworkConfig(layers=3, steps=300, batch=500, learning_rate=5e-3, warm_up=30)
+    )
+    """`linear`: of the run that finds the sides. Slower learning has not found the hole of a torus by then."""
     network: NetworkConfig = field(default_factory=NetworkConfig)
     """The other methods."""
     smoothness: tuple[float, ...] = (0.1, 0.5, 2.0)

