@@ -11,8 +11,8 @@ from PIL import Image
 from .errors import Cancelled, ErrorCode, ReconstructionError
 from .machine import choose_device, set_up_torch
 from .maths.raycast import RayCaster, render_mesh
-from .mesh_files import MeshFileError, read_mesh
-from .records import RecordUnreadable, load_record
+from .mesh_files import read_mesh
+from .records import load_record
 from .results import RADIANCE, Writers
 from .scene import Camera, Progress, within
 from .stages.known_cameras import read_cameras
@@ -78,7 +78,7 @@ def _drawing(job: Path, device_kind: str) -> Draw:
             return _radiance_drawing(load_record(job / RADIANCE, Radiance), device_kind)
         if (job / "mesh.ply").is_file():
             return _mesh_drawing(job / "mesh.ply")
-    except (RecordUnreadable, MeshFileError, ValueError) as error:
+    except ValueError as error:  # RecordUnreadable, MeshFileError, or parameters of another shape
         text = f"What {job} holds cannot be read ({error})."
         remedy = "Run the reconstruction again with this version of FewView."
         raise ReconstructionError(ErrorCode.SETTINGS_INVALID, text, remedy) from error

@@ -110,7 +110,7 @@ def main(words: Sequence[str]) -> int:
     add("--width", type=int, default=800)
     add("--height", type=int, default=600)
     add("--samples", type=int, default=32)
-    add("--preset", choices=("fast", "balanced", "detailed"), default="balanced")
+    add("--preset", choices=("fast", "balanced", "detailed", "nerf"), default="balanced")
     add("--seed", type=int, default=0)
     add("--output", type=Path, required=True, help="folder in which views and job get their own")
     add("--save", type=Path, metavar="FILE.blend")

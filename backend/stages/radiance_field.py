@@ -40,7 +40,7 @@ class RadianceShape:
     width: int = 64
     layers: int = 4
     """Hidden layers between place and density."""
-    frequencies: int = 7
+    frequencies: int = 8
     """Of the encoded place; the finest wave is 2^(2 - frequencies) object units long."""
     direction_frequencies: int = 2
     proposal_width: int = 32

@@ -75,6 +75,24 @@ def rendered(folder: Path, job: str, output: str = "pictures") -> tuple[str, ...
     return render_job(folder / job, cameras, folder / output, "cpu", no_progress)
 
 
+def program(
+    command: str, subject: Path, folder: Path, *more: str, output: Path
+) -> "subprocess.CompletedProcess[str]":
+    """The command as a user starts it, with the folder's cameras."""
+    options = ["--cameras", str(folder / "images" / "transforms.json"), "--output", str(output)]
+    result = subprocess.run(
+        [sys.executable, "-m", "backend", command, str(subject), *options, "--device", "cpu", *more],
+        cwd=ROOT,
+        env={**clean_environment(os.environ), "OMP_NUM_THREADS": "1"},
+        timeout=300,
+        check=False,
+        capture_output=True,
+        text=True,
+    )
+    assert result.returncode == 0, result.stderr
+    return result
+
+
 def pixels(path: Path) -> np.ndarray:
     with Image.open(path) as file:
         return np.asarray(file).astype(int)
@@ -88,18 +106,7 @@ def refusal(folder: Path, job: str = "nerf", output: str = "pictures") -> Recons
 
 def test_the_program_renders_a_radiance_field(folder: Path, scene: Scene) -> None:
     """No photograph is there, only the cameras."""
-    files = {"--cameras": folder / "images" / "transforms.json", "--output": folder / "pictures"}
-    options = [word for option, path in files.items() for word in (option, str(path))]
-    result = subprocess.run(
-        [sys.executable, "-m", "backend", "render", str(folder / "nerf"), *options, "--device", "cpu"],
-        cwd=ROOT,
-        env={**clean_environment(os.environ), "OMP_NUM_THREADS": "1"},
-        timeout=120,
-        check=False,
-        capture_output=True,
-        text=True,
-    )
-    assert result.returncode == 0, result.stderr
+    result = program("render", folder / "nerf", folder, output=folder / "pictures")
     names = [f"view_{index:02d}.png" for index in range(3)]
     assert result.stdout.split() == [str(folder / "pictures" / name) for name in names]
     assert "[1/1] render done" in result.stderr
@@ -146,7 +153,9 @@ def test_rendered_again_the_pictures_are_replaced_but_strangers_are_left_alone(f
 
 def test_a_job_s_own_folder_gets_no_pictures(folder: Path) -> None:
     (folder / "nerf" / "cameras.json").write_text("{}")
-    assert refusal(folder, output="nerf").code is ErrorCode.OUTPUT_UNUSABLE
+    error = refusal(folder, output="nerf")
+    assert error.code is ErrorCode.OUTPUT_UNUSABLE
+    assert "results of a reconstruction" in error.text
 
 
 def test_what_is_no_job_is_told(folder: Path) -> None:
@@ -182,3 +191,21 @@ def test_stopped_nothing_is_left(folder: Path) -> None:
         render_job(folder / "nerf", folder / "images" / "transforms.json", folder / "pictures", "cpu", listen)
     assert told == sorted(told)
     assert not (folder / "pictures").exists()
+
+
+@pytest.mark.slow
+def test_from_photographs_to_a_field_and_from_it_to_pictures(tmp_path: Path) -> None:
+    """In two seconds of fitting little is learned, but all is there, and a second run takes it up."""
+    write_scene(photographed(ring_cameras(6, 48)), tmp_path)
+    words = ("--preset", "nerf", "--budget-seconds", "2")
+    first = program("reconstruct", tmp_path / "images", tmp_path, *words, output=tmp_path / "job")
+    assert str(tmp_path / "job" / RADIANCE) in first.stdout.split()
+    report = json.loads((tmp_path / "job" / "report.json").read_text())
+    assert report["num_stereo_points"] == 0
+    said = {decision["what"]: decision["because"] for decision in report["decisions"]}
+    assert said["field"] == "2 s given"
+    assert "a density has no surface of its own" in said["surface"]
+    again = program("reconstruct", tmp_path / "images", tmp_path, *words, output=tmp_path / "job")
+    assert "Resuming: photos, cameras, region, stereo, train, mesh are done" in again.stderr
+    program("render", tmp_path / "job", tmp_path, output=tmp_path / "pictures")
+    assert pixels(tmp_path / "pictures" / "view_05.png").shape == (36, 48, 4)

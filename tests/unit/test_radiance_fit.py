@@ -157,7 +157,7 @@ def test_parameters_of_another_shape_are_refused() -> None:
 def test_an_even_background_is_learned() -> None:
     """Without masks, before black: the colour behind is found, and the body stands before it."""
     views = tuple(view for view in scene().without_masks().views[:-1])
-    radiance = fitted(views, replace(CONFIG, steps=300)).radiance
+    radiance = fitted(views, CONFIG).radiance
     assert radiance is not None
     assert radiance.background_srgb is not None
     assert radiance.background_srgb.max() < 0.1
