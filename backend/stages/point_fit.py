@@ -60,7 +60,7 @@ class PointFitConfig:
     sides: NetworkConfig = field(
         default_factory=lambda: NetworkConfig(layers=3, steps=300, batch=500, learning_rate=5e-3, warm_up=30)
     )
-    """`linear`: of the run that finds the sides. Slower learning has not found the hole of a torus by then."""
+    """`linear`: of the run that finds the sides. With slower learning a torus is still without its hole."""
     network: NetworkConfig = field(default_factory=NetworkConfig)
     """The other methods."""
     smoothness: tuple[float, ...] = (0.1, 0.5, 2.0)
