@@ -4,6 +4,8 @@
                                 backend.log   what the backend's libraries said
                                 result/       the backend's own folder: mesh.ply, cameras.json
     PARENT/views-001/           rendered views: images/, transforms.json, truth.ply
+    PARENT/points-001/          cloud.ply     points alone
+                                backend.log, result/
 
 A job never writes outside its folder, and a name that a backend gives is only taken if it lies inside.
 """
@@ -14,7 +16,7 @@ from pathlib import Path
 
 from ..backend.wire.protocol import Job, ProtocolError, decode_job, encode_job
 
-JOB_FILE, LOG, RESULT = "job.json", "backend.log", "result"
+JOB_FILE, LOG, RESULT, CLOUD = "job.json", "backend.log", "result", "cloud.ply"
 MESH, CAMERAS, REPORT_PAGE, REPORT_NUMBERS, SPARSE = (
     "mesh.ply",
     "cameras.json",
@@ -91,6 +93,11 @@ def read_job(folder: Path) -> PastJob:
     if not (folder / RESULT / MESH).is_file():
         raise FolderError(f"The job {folder.name} has no mesh yet")
     return PastJob(folder=folder, job=job)
+
+
+def has_fit(folder: Path) -> bool:
+    """Whether it is a folder of points with the surface that was fitted to them; such have no job.json."""
+    return (folder / CLOUD).is_file() and (folder / RESULT / MESH).is_file()
 
 
 def past_jobs(parent: Path) -> tuple[PastJob, ...]:

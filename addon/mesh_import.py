@@ -44,6 +44,8 @@ class MeshImport:
     scene_name: str
     world_from_solved: NDArray[np.float64]
     """(4, 4) similarity; baked into the vertices."""
+    name: str = ""
+    """Of the result; that of the job's folder where this is empty."""
     parent_uid: int | None = None
     """`session_uid` of the object that the result shall follow when it is moved."""
 
@@ -63,7 +65,7 @@ def import_mesh(mesh: PlyMesh, wanted: MeshImport) -> Stepwise[None]:
     ValueError where it would lie out of reach.
     """
     arrays = yield from _in_thread(partial(mesh_arrays, mesh, wanted.world_from_solved))
-    uid = yield from _build(Path(wanted.job).name or "FewView", arrays)
+    uid = yield from _build(wanted.name or Path(wanted.job).name or "FewView", arrays)
     _show_result(uid, arrays, wanted)
 
 

@@ -285,6 +285,25 @@ class FEWVIEW_PT_past_jobs(_Panel, bpy.types.Panel):
             self.layout.label(text="None in the output folder")
 
 
+class FEWVIEW_PT_points(_Panel, bpy.types.Panel):
+    """A surface without photographs"""
+
+    bl_label = "Points Alone"
+    bl_parent_id = "FEWVIEW_PT_main"
+    bl_options = {"DEFAULT_CLOSED"}
+
+    def draw(self, context: bpy.types.Context) -> None:
+        """What it does, how, and start."""
+        layout, settings = self.layout, settings_of(context)
+        draw_text(layout, context, "A closed surface on the points of the active mesh or point cloud")
+        column = layout.column()
+        column.use_property_split = True
+        column.use_property_decorate = False
+        column.prop(settings, "point_method")
+        column.prop(settings, "point_normals")
+        layout.operator("fewview.fit_points", icon="OUTLINER_OB_POINTCLOUD")
+
+
 def _draw_render(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
     settings = settings_of(context)
     column = layout.column()
@@ -366,4 +385,5 @@ CLASSES = (
     FEWVIEW_PT_advanced,
     FEWVIEW_PT_result,
     FEWVIEW_PT_past_jobs,
+    FEWVIEW_PT_points,
 )

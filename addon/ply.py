@@ -1,4 +1,5 @@
-"""Reads the PLY files that the backend writes; numpy and the standard library, no Blender needed.
+"""Reads the PLY files that the backend writes, and writes points for it; numpy and the standard library, no
+Blender needed.
 
     mesh.ply preview.ply     positions, normals, 8-bit sRGB colours, `support`, triangles
     points.ply sparse.ply    the same without triangles, with `confidence` or nothing in place of `support`
@@ -91,6 +92,15 @@ def read_ply(path: Path) -> PlyMesh:
     if len(body) != layout.num_bytes:
         raise ValueError(f"{path.name} changed while it was read")
     return _mesh(body, layout, path.name)
+
+
+def write_points(path: Path, positions: NDArray[np.float64], normals: NDArray[np.float64] | None) -> None:
+    """Write points (points, 3), in double precision, with normals (points, 3) where there are any."""
+    names = _POSITION if normals is None else (*_POSITION, *_NORMAL)
+    table = positions if normals is None else np.hstack([positions, normals])
+    properties = "".join(f"property double {name}\n" for name in names)
+    header = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(table)}\n{properties}"
+    path.write_bytes(header.encode("ascii") + _END + table.astype("<f8").tobytes())
 
 
 def _open_without_waiting(path: str, flags: int) -> int:

@@ -11,8 +11,17 @@ STAGE_SECONDS = {
     "python": 5.0,
     "packages": 90.0,
     "check": 8.0,
+    "points": 0.5,
+    "surface": 12.0,
 }
 """What stages typically take beside each other, for the share of the whole; another one counts as 1."""
+
+_RUNS = (
+    ("photos", "cameras", "region", "stereo", "train", "mesh", "report"),
+    ("points", "surface", "mesh"),
+    ("python", "packages", "check"),
+)
+"""Which stages follow one another, so that what is left can be told."""
 
 STAGE_WORDS = {
     "photos": "Reading photographs",
@@ -26,6 +35,8 @@ STAGE_WORDS = {
     "python": "Preparing Python",
     "packages": "Installing packages",
     "check": "Checking",
+    "points": "Reading points",
+    "surface": "Fitting the surface",
 }
 _LEAST_SHARE = 0.04
 """Before that, nothing can be said of the time left."""
@@ -40,8 +51,7 @@ def total_share(stages_before: list[str], stage: str, num_left: int, fraction: f
     """Share of the whole job, 0 to 1, in a stage after others and before `num_left` of unknown names."""
     done = sum(_seconds(name) for name in stages_before)
     this = _seconds(stage)
-    names = list(STAGE_SECONDS)
-    following = names[names.index(stage) + 1 :] if stage in names else []
+    following = next((run[run.index(stage) + 1 :] for run in _RUNS if stage in run), ())
     left = sum(_seconds(name) for name in following[:num_left]) + max(num_left - len(following), 0)
     return min(max((done + fraction * this) / (done + this + left), 0.0), 1.0)
 

@@ -200,6 +200,27 @@ class FEWVIEW_PG_settings(bpy.types.PropertyGroup):
         name="Truth", description="Mesh file that the result is measured against", subtype="FILE_PATH"
     )
 
+    # Points alone
+    point_method: EnumProperty(
+        name="Method",
+        items=[
+            ("linear", "Linear", "The smoothest field that agrees with the points, in seconds"),
+            (
+                "neural-pull",
+                "Neural-Pull",
+                "For comparison: a network that pulls points onto the surface, slow",
+            ),
+            ("nap", "NAP", "For comparison: a network pulled from the worst places near its samples, slow"),
+            ("sdro", "SDRO", "For comparison: a network against the worst distribution of samples, slow"),
+            ("entropy", "Entropy", "For comparison: a network that is undecided on the surface alone, slow"),
+        ],
+    )
+    point_normals: BoolProperty(
+        name="Normals Are Known",
+        description="The mesh's faces are trusted: the surface shall face as they do",
+        default=False,
+    )
+
     # 5. Result
     result: PointerProperty(name="Result", description="Mesh that was imported last", type=bpy.types.Object)
     decimate_ratio: FloatProperty(

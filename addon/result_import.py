@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from . import camera_lens, undo_step
 from .camera_objects import POINTS, ROLE, CameraImport, import_steps, objects_of, read_import, root_or_none
 from .frames import frame_owner, has_own_frame, world_from_solved_or_none
-from .job_folder import CAMERAS, MESH, PastJob, inside, read_job
+from .job_folder import CAMERAS, MESH, RESULT, PastJob, has_fit, inside, read_job
 from .mesh_import import MeshImport, import_mesh, read_in_steps
 from .placing import upright_from_solved
 from .scenes import scene_named
@@ -30,6 +30,9 @@ def import_result_steps(
     itself. The mesh is read first: where it cannot be used, the scene is left as it is. Raises
     FolderError, ValueError or OSError with a sentence for the user.
     """
+    if has_fit(folder):
+        yield from import_fit_steps(folder, scene_name=scene_name, undo=undo)
+        return
     job = read_job(folder)
     mesh = yield from read_in_steps(inside(job.folder, job.result / MESH))
     found = _cameras_or_none(job)
@@ -54,6 +57,17 @@ def import_result_steps(
     _settle(scene_named(scene_name), job)
     if undo:
         undo_step.push(f"Import {job.folder.name}")
+
+
+def import_fit_steps(folder: Path, *, scene_name: str, name: str = "", undo: bool = True) -> Iterator[None]:
+    """Import the surface of points, which lie in the world frame, as `import_result_steps` does a job's."""
+    mesh = yield from read_in_steps(inside(folder, folder / RESULT / MESH))
+    wanted = MeshImport(
+        job=str(folder.absolute()), scene_name=scene_name, world_from_solved=np.eye(4), name=name
+    )
+    yield from import_mesh(mesh, wanted)
+    if undo:
+        undo_step.push(f"Import {name or folder.name}")
 
 
 def show_estimated_cameras(path: Path, job: PastJob, scene_name: str) -> Iterator[None]:

@@ -43,7 +43,7 @@ def true_mesh(objects: tuple[Any, ...]) -> TrueMesh:
     for instance in depsgraph.object_instances:
         owner = (instance.parent if instance.is_instance else instance.object).original
         if owner in order and instance.show_self and instance.object.type in WITH_SURFACE:
-            part = _evaluated(instance.object, np.array(instance.matrix_world, np.float64))
+            part = evaluated_mesh(instance.object, np.array(instance.matrix_world, np.float64))
             found.append((order[owner], part))
     parts = [part for _, part in sorted(found, key=lambda item: item[0]) if len(part.faces)]
     if not parts:
@@ -58,7 +58,11 @@ def true_mesh(objects: tuple[Any, ...]) -> TrueMesh:
     )
 
 
-def _evaluated(made: Any, world_from_object: NDArray[np.float64]) -> TrueMesh:
+def evaluated_mesh(made: Any, world_from_object: NDArray[np.float64]) -> TrueMesh:
+    """An evaluated object in the world frame; one that is closed faces outwards.
+
+    Without faces its normals are 0.
+    """
     mesh = made.to_mesh()
     mesh.calc_loop_triangles()
     vertices = np.empty(len(mesh.vertices) * 3, np.float32)

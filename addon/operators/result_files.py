@@ -7,7 +7,7 @@ from bpy.props import BoolProperty, EnumProperty, StringProperty
 
 from .. import result_mesh
 from ..camera_objects import JOB
-from ..job_folder import REPORT_PAGE, RESULT, FolderError, inside, past_jobs, read_job
+from ..job_folder import REPORT_PAGE, RESULT, FolderError, has_fit, inside, past_jobs, read_job
 from ..result_mesh import result_or_none
 from .on_result import RECONSTRUCT_FIRST, OnResult, Status, refused, result_of
 from .reconstruct import jobs_parent
@@ -81,7 +81,8 @@ class _OnFolder:
             return read_job(Path(bpy.path.abspath(self.folder)).absolute()).folder
         result = result_or_none(context)
         if result is not None and result.get(JOB):
-            return read_job(Path(str(result[JOB]))).folder
+            folder = Path(str(result[JOB]))
+            return folder if has_fit(folder) else read_job(folder).folder
         found = past_jobs(jobs_parent(context))
         if not found:
             raise FolderError(RECONSTRUCT_FIRST)

@@ -1,6 +1,7 @@
 """All operators: their words, whether they can be undone, why each is greyed; the list of photographs."""
 
 import importlib
+import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -52,6 +53,18 @@ class Situation:
 
     def wrong_backend(self) -> None:
         self.patch.setenv("FEWVIEW_PYTHON", str(self.folder / "nowhere"))
+
+    def some_backend(self) -> None:
+        self.patch.setenv("FEWVIEW_PYTHON", sys.executable)
+        self.patch.setattr(self.part("environment"), "_known", {})
+
+    def few_points(self) -> None:
+        self.some_backend()
+        self.result()
+
+    def editing_points(self) -> None:
+        self.some_backend()
+        self.editing()
 
     def offline(self) -> None:
         bpy.context.preferences.system.use_online_access = False
@@ -109,6 +122,16 @@ OPERATORS = {
     "estimate_cameras": Expected(undo=False, grey=((Situation.running, "Wait for"), *NEEDS_BACKEND)),
     "export": Expected(undo=False, grey=ON_RESULT),
     "fit_region": Expected(undo=True),
+    "fit_points": Expected(
+        undo=False,
+        grey=(
+            (Situation.running, "still running"),
+            *NEEDS_BACKEND,
+            (Situation.some_backend, "Select a mesh or a point cloud"),
+            (Situation.few_points, "Only 3 points"),
+            (Situation.editing_points, "Object Mode"),
+        ),
+    ),
     "generate_views": Expected(undo=True, grey=((Situation.nothing, "Add an object"),)),
     "import_cameras": Expected(undo=True),
     "import_result": Expected(undo=True, grey=((Situation.editing, "Object Mode"),)),

@@ -7,6 +7,7 @@ import pytest
 from addon.progress import seconds_left, stage_words, time_words, total_share
 
 RUN = ["photos", "cameras", "region", "stereo", "train", "mesh", "report"]
+FIT = ["points", "surface", "mesh"]
 
 
 def shares(names: list[str]) -> list[float]:
@@ -19,7 +20,7 @@ def shares(names: list[str]) -> list[float]:
 
 
 @pytest.mark.parametrize(
-    "names", [RUN, RUN[:3], ["render"], ["python", "packages", "check"], ["a", "b", "c"]]
+    "names", [RUN, RUN[:3], FIT, ["render"], ["python", "packages", "check"], ["a", "b", "c"]]
 )
 def test_it_goes_from_nothing_to_all_and_never_back(names: list[str]) -> None:
     found = shares(names)
@@ -28,8 +29,9 @@ def test_it_goes_from_nothing_to_all_and_never_back(names: list[str]) -> None:
     assert all(later >= earlier for earlier, later in pairwise(found))
 
 
-def test_a_stage_ends_where_the_next_begins() -> None:
-    found = shares(RUN)
+@pytest.mark.parametrize("names", [RUN, FIT])
+def test_a_stage_ends_where_the_next_begins(names: list[str]) -> None:
+    found = shares(names)
     assert found[2:-1:3] == pytest.approx(found[3::3])
 
 

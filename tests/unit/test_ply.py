@@ -9,8 +9,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from addon.ply import read_ply
+from addon.ply import write_points as write_cloud
 from backend.mesh_files import write_mesh, write_points
 from backend.scene import Region, SurfaceMesh, SurfacePoints, to_unit_sphere
+from backend.stages.point_cloud import read_cloud
 
 TRIANGLE = b"""ply
 format binary_little_endian 1.0
@@ -69,6 +71,22 @@ def test_it_reads_points(tmp_path: Path) -> None:
     np.testing.assert_allclose(found.positions, 2.0)
     assert found.faces.shape == (0, 3)
     np.testing.assert_array_equal(found.support, mesh.support)
+
+
+@pytest.mark.parametrize("with_normals", [False, True])
+def test_the_backend_reads_the_points_that_it_writes(tmp_path: Path, with_normals: bool) -> None:
+    mesh = some_mesh(50, 0)
+    normals = mesh.normals.astype(np.float64) if with_normals else None
+    write_cloud(tmp_path / "cloud.ply", mesh.vertices, normals)
+    found = read_cloud(tmp_path / "cloud.ply")
+    np.testing.assert_array_equal(found.positions, mesh.vertices)
+    if normals is None:
+        assert found.normals is None
+    else:
+        np.testing.assert_allclose(found.normals, normals, atol=1e-6)
+    own = read_ply(tmp_path / "cloud.ply")
+    np.testing.assert_array_equal(own.positions, mesh.vertices)
+    assert (own.normals is None) == (normals is None)
 
 
 def test_what_is_not_there_is_none(tmp_path: Path) -> None:
