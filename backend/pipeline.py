@@ -253,7 +253,7 @@ def _reconstructed(
     views = solved.views
     if len(stereo.points.positions):
         previews.show_points(stereo.points, region)
-    chance = {"device": device, "generator": torch.Generator(device).manual_seed(job.seed)}
+    chance = {"device": device, "generator": torch.Generator().manual_seed(job.seed)}
     show = partial(previews.show_surface, points=stereo.points, region=region)
     fit = partial(stages.fit_surface, views, region, stereo, settings.train, show=show, **chance)
     surface = this.stage("train", fit)

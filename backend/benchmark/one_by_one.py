@@ -76,7 +76,7 @@ def fit(
     """The field, and the seconds that it took. Raises ReconstructionError."""
     _, train = surface_configs(settings)
     work = partial(fit_surface, placed.views, placed.region, stereo, train, show=show)
-    generator = torch.Generator(device).manual_seed(seed)
+    generator = torch.Generator().manual_seed(seed)
     return _timed(partial(work, device=device, generator=generator, progress=no_progress))
 
 

@@ -2,19 +2,16 @@
 
 import argparse
 import json
-import logging
-import sys
 import time
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ..errors import ErrorCode, ReconstructionError
-from ..failures import explain_or_none, internal_error
 from ..wire import protocol
 from ..wire.speaker import Speaker
-from .cancelling import CancelRequest, catch_signals, watch_signals
-from .reconstruct import EXIT_USER_ERROR, converse, say_last, settle
+from .cancelling import CancelRequest, catch_signals
+from .reconstruct import converse, say_last, with_terminal
 
 if TYPE_CHECKING:
     from ..maths.metrics import ErrorAgainstTruth, TrueSurface
@@ -26,8 +23,6 @@ POINT_METHODS = ("linear", "neural-pull", "nap", "sdro", "entropy")
 """As `stages.point_fit` and `stages.point_network` name them; here, so that --help needs no torch."""
 
 _STAGES = ("points", "surface", "mesh")
-
-logger = logging.getLogger(__name__)
 
 
 def add_fit_points(parser: argparse.ArgumentParser) -> None:
@@ -55,20 +50,10 @@ def fit_points_command(parsed: argparse.Namespace) -> int:
 
 
 def _on_terminal(parsed: argparse.Namespace) -> int:
-    try:
-        from ..terminal import terminal_listener  # here, because rich may be missing
-    except ImportError as error:
-        known = explain_or_none(error) or internal_error(error)
-        sys.stderr.write(f"Error: {known.text}\n{known.remedy}\n")
-        return EXIT_USER_ERROR
-    request = CancelRequest()
-    with terminal_listener(request) as listener:
-        watch_signals(request, listener.stopping)
-        return settle(
-            lambda: listener.finished(parsed.output, _fit(parsed, listener)),
-            failed=listener.failed,
-            cancelled=lambda: listener.warned(_cancelled().text),
-        )
+    return with_terminal(
+        lambda listener: listener.finished(parsed.output, _fit(parsed, listener)),
+        cancelled=lambda listener: listener.warned(_cancelled().text),
+    )
 
 
 def _on_wire(parsed: argparse.Namespace) -> int:

@@ -8,7 +8,7 @@ from .measurements import Measurements
 from .silhouettes import least_distance, missing, silhouette_rays
 from .unseen_side import DEEPEST, depth_is_bounded, explained_radius, widest_angle_deg
 
-_NODES = 32
+_NODES = 48
 _ROUNDS = 6
 """Of each trial."""
 _GROWTH = 1.2
