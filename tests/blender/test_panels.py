@@ -645,6 +645,14 @@ def test_past_jobs_can_be_imported(sidebar: Sidebar) -> None:
     assert buttons[0].button.folder == str(folders[3])
 
 
+def test_points_alone_have_a_box(sidebar: Sidebar) -> None:
+    layout = sidebar.draw_all()["FEWVIEW_PT_points"]
+    assert set(layout.operators()) == {"fewview.fit_points"}
+    assert layout.props() == {"point_method", "point_normals"}
+    assert layout.main() == []  # it is not the step to take next
+    assert "DEFAULT_CLOSED" in sidebar.panels.FEWVIEW_PT_points.bl_options
+
+
 # Undo and other files.
 
 
