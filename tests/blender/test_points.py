@@ -62,7 +62,7 @@ def directions(count: int) -> np.ndarray:
     return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
 
 
-def cloud(positions: np.ndarray, *, normals: np.ndarray | None = None, kind: str = "POINTCLOUD") -> Any:
+def cloud(positions: np.ndarray, *, normals: np.ndarray | None = None, kind: str = "MESH") -> Any:
     """The active object: a mesh of vertices alone, or a point cloud."""
     mesh = bpy.data.meshes.new("Cloud")
     mesh.from_pydata(positions.tolist(), [], [])
@@ -74,6 +74,8 @@ def cloud(positions: np.ndarray, *, normals: np.ndarray | None = None, kind: str
     bpy.context.view_layer.objects.active = made
     made.select_set(True)
     if kind == "POINTCLOUD":
+        if kind not in bpy.ops.object.convert.get_rna_type().properties["target"].enum_items:
+            pytest.skip("this Blender makes point clouds in Geometry Nodes alone")
         bpy.ops.object.convert(target="POINTCLOUD")
     assert bpy.context.object.type == kind
     return bpy.context.object
