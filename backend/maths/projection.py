@@ -18,6 +18,12 @@ def projected(
 
 def in_picture(points: Float[np.ndarray, "points 3"], camera: Camera) -> Bool[np.ndarray, "points"]:
     """True where a point lies in front of the camera and within its picture's edges."""
-    pixels, depth = projected(points, camera)
+    return shown(*projected(points, camera), camera)
+
+
+def shown(
+    pixels: Float64[np.ndarray, "points 2"], depth: Float64[np.ndarray, "points"], camera: Camera
+) -> Bool[np.ndarray, "points"]:
+    """The same of points that have been projected."""
     within = (pixels >= 0) & (pixels < [camera.width, camera.height])
     return np.asarray(within.all(axis=1) & (depth > 0))

@@ -12,8 +12,8 @@ from jaxtyping import Bool, Float64, Int64
 from scipy.ndimage import label
 
 from ..errors import ErrorCode, ReconstructionError
-from ..maths.projection import in_picture, projected
-from ..scene import Camera, Decision, Progress, Region, SolvedCameras, View, to_unit_sphere, transform_points
+from ..maths.projection import in_picture, projected, shown
+from ..scene import Camera, Decision, Progress, Region, SolvedCameras, View, to_unit_sphere
 
 FEATURES_REACH = 1.1
 """The surface goes on where features end."""
@@ -180,14 +180,14 @@ def _check_in_common(views: list[View], hull: Float64[np.ndarray, "cells 3"], ce
 def _share_filled(view: View, hull: Float64[np.ndarray, "cells 3"], cell: float) -> float:
     """Of a mask, by the hull's cells: of squares of the photograph that are a little wider than a cell."""
     assert view.mask is not None
-    x, y, z = (transform_points(view.camera.camera_from_world, hull) @ view.camera.intrinsics.T).T
-    front = z > 0
+    pixels, depth = projected(hull, view.camera)
+    front = depth > 0
     if not front.any():
         return 0.0
-    square_px = max(1.0, 1.5 * cell * view.camera.fx_px / float(np.median(z[front])))
+    square_px = max(1.0, 1.5 * cell * view.camera.fx_px / float(np.median(depth[front])))
     squares = math.ceil(max(view.mask.shape) / square_px)
     filled, on = np.zeros((2, squares, squares), bool)
-    row, column = ((at[front] / z[front] / square_px).astype(int) for at in (y, x))
+    column, row = (pixels[front] / square_px).astype(int).T
     inside = (row >= 0) & (row < squares) & (column >= 0) & (column < squares)
     filled[row[inside], column[inside]] = True
     rows, columns = np.nonzero(view.mask > 0.5)
@@ -240,10 +240,11 @@ def _masks_around(points: Float64[np.ndarray, "points 3"], views: list[View]) ->
     off, on = np.zeros(len(points), bool), np.zeros(len(points), np.int64)
     for view in views:
         assert view.mask is not None
-        shown = in_picture(points, view.camera)
-        column, row = projected(points[shown], view.camera)[0].astype(int).T
+        pixels, depth = projected(points, view.camera)
+        visible = shown(pixels, depth, view.camera)
+        column, row = pixels[visible].astype(int).T
         inside = np.zeros(len(points), bool)
-        inside[shown] = view.mask[row, column] > 0.5
-        off |= shown & ~inside
+        inside[visible] = view.mask[row, column] > 0.5
+        off |= visible & ~inside
         on += inside
     return np.where(off, 0, on)

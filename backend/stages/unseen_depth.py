@@ -6,7 +6,7 @@ from ..scene import Decision
 from .linear_fit import LinearConfig, fit_level, start
 from .measurements import Measurements
 from .silhouettes import least_distance, missing, silhouette_rays
-from .unseen_side import DEEPEST, depth_is_bounded, explained_radius, widest_angle_deg
+from .unseen_side import DEEPEST, depth_is_bounded, explained_radius, widest_view_angle_deg
 
 _NODES = 48
 _ROUNDS = 6
@@ -21,7 +21,7 @@ def depth_behind(scene: Measurements, config: LinearConfig) -> tuple[float, Deci
     """Radius of the ball behind, in half widths of the subject, and what decided it."""
     explained = explained_radius(scene)
     radius = _met_radius(scene, explained, config)
-    angle_deg = widest_angle_deg(scene)
+    angle_deg = widest_view_angle_deg(scene)
     because = f"the photographs are taken from sides up to {angle_deg:.0f} degrees apart"
     if radius > explained:
         because += f"; with the {explained:.2f} that measured points ask for, silhouettes were missed"

@@ -1,12 +1,11 @@
 """What is assumed of the side that no photograph shows: a ball behind what was measured."""
 
-import math
-
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
+from ..maths.angles import widest_angle_deg
 from ..maths.geometry import project
 from ..maths.grid import node_positions
 from .measurements import Measurements
@@ -49,15 +48,15 @@ def _mean(scene: Measurements, values: Float[Tensor, "points 3"]) -> Float[Tenso
     return (scene.confidence / scene.confidence.sum()) @ values
 
 
-def widest_angle_deg(scene: Measurements) -> float:
+def widest_view_angle_deg(scene: Measurements) -> float:
     """Largest angle between two cameras, seen from the region's middle."""
-    directions = F.normalize(torch.stack([c.position for c in scene.cameras]) - scene.region_centre, dim=-1)
-    return math.degrees(math.acos(float((directions @ directions.T).min().clamp(-1, 1))))
+    apart = torch.stack([c.position for c in scene.cameras]) - scene.region_centre
+    return widest_angle_deg(F.normalize(apart.cpu().double(), dim=-1).numpy())
 
 
 def depth_is_bounded(scene: Measurements) -> float:
     """Whether silhouettes bound the depth: 0 if the photographs are taken from one side, 1 if from many."""
-    return min(max((widest_angle_deg(scene) - 50) / 40, 0.0), 1.0)
+    return min(max((widest_view_angle_deg(scene) - 50) / 40, 0.0), 1.0)
 
 
 def _half_width(scene: Measurements, at: Float[Tensor, "3"]) -> float:

@@ -67,11 +67,11 @@ def _exposures(
     channels = range(3)
     found = np.stack([log_exposures(log_light[..., c], shown) for c in channels], axis=1)
     stops = float(np.abs(found).max()) / math.log(2)
-    before = max(disagreement(log_light[..., c], shown) for c in channels)
-    after = max(disagreement(log_light[..., c] - found[:, c, None], shown) for c in channels)
     says = f"photographs differ from their mean by up to {stops:.2f} stops"
     if stops < _LEAST_STOPS:
         return np.zeros_like(found), Decision(what=_WHAT, choice="left as it is", because=says)
+    before = max(disagreement(log_light[..., c], shown) for c in channels)
+    after = max(disagreement(log_light[..., c] - found[:, c, None], shown) for c in channels)
     says += (
         f"; without that, two of them differ by {math.expm1(after):.1%} instead of {math.expm1(before):.1%}"
     )

@@ -1,33 +1,19 @@
 """Pixels of the unit sphere are those whose rays come nearer than 1 to its centre; rays go through them."""
 
-import numpy as np
 import torch
 
 from backend.maths.geometry import project
 from backend.maths.rays import sphere_span
-from backend.scene import SurfacePoints
 from backend.stages.measurements import Measurements, measurements
 from backend.stages.pixels import pixels_of_unit_sphere, rays_through
-from backend.stages.stereo import DepthMap, StereoResult
+from backend.stages.stereo import unmatched
 from tests.synthetic_scene import Scene, photographed, ring_cameras, true_region
 
 
 def measured(scene: Scene) -> Measurements:
     """The views in the region's frame, without points."""
-    nothing = np.zeros((0, 3), np.float32)
-    points = SurfacePoints(
-        positions=nothing,
-        normals=nothing,
-        colours_srgb=nothing,
-        confidence=nothing[:, 0],
-        num_views=np.zeros(0, np.int64),
-        view_index=np.zeros(0, np.int64),
-    )
-    blank = np.zeros(scene.coverage[0].shape, np.float32)
-    maps = (DepthMap(depth=blank, confidence=blank, empty=None, subject=None),) * len(scene.views)
     region = true_region()
-    stereo = StereoResult(points=points, depth_maps=maps)
-    return measurements(scene.views, region, region, stereo, torch.device("cpu"))
+    return measurements(scene.views, region, region, unmatched(scene.views), torch.device("cpu"))
 
 
 def test_rays_of_the_unit_sphere_go_through_it_and_through_their_pixels() -> None:

@@ -15,15 +15,14 @@ from torch import Tensor
 
 from backend.maths.geometry import Pinhole, pixel_centres, project, ray_directions
 from backend.maths.grid import locate, node_positions, spacing, value_and_gradient
-from backend.scene import SurfacePoints, transform_points
+from backend.scene import transform_points
 from backend.stages.linear_fit import LinearConfig, fit_level, start
 from backend.stages.measurements import Measurements, measurements
 from backend.stages.rims import rim_points, rim_rays
-from backend.stages.stereo import DepthMap, StereoResult
+from backend.stages.stereo import unmatched
 from tests.synthetic_scene import (
     DISTANCE,
     SIZE,
-    Scene,
     photographed,
     ring_cameras,
     surface_distance,
@@ -181,7 +180,7 @@ def test_rims_of_masks_lie_on_the_body_but_for_a_pixel() -> None:
     """Of whole pixels, whose steps turn the normals."""
     scene = photographed(ring_cameras(3, WIDTH))
     region = true_region()
-    of_masks = measurements(scene.views, region, region, nothing_measured(scene), CPU)
+    of_masks = measurements(scene.views, region, region, unmatched(scene.views), CPU)
     nodes_world = transform_points(region.world_from_object, node_positions(64, CPU).double().numpy())
     distance = torch.tensor(surface_distance(nodes_world.reshape(-1, 3))) / region.radius_world
     positions, normals = touched(of_masks, distance.reshape(64, 64, 64).float())
@@ -192,21 +191,6 @@ def test_rims_of_masks_lie_on_the_body_but_for_a_pixel() -> None:
     assert np.median(off) < 0.3 * pixel
     assert np.quantile(off, 0.95) < pixel
     assert angles_deg(normals, torch.tensor(true_normals(world)).float()).median() < 5
-
-
-def nothing_measured(scene: Scene) -> StereoResult:
-    nothing = np.zeros((0, 3), np.float32)
-    points = SurfacePoints(
-        positions=nothing,
-        normals=nothing,
-        colours_srgb=nothing,
-        confidence=nothing[:, 0],
-        num_views=np.zeros(0, np.int64),
-        view_index=np.zeros(0, np.int64),
-    )
-    blank = [np.zeros(depth.shape, np.float32) for depth in scene.depths]
-    maps = tuple(DepthMap(depth=b, confidence=b, empty=None, subject=None) for b in blank)
-    return StereoResult(points=points, depth_maps=maps)
 
 
 def test_rims_lie_half_a_cell_apart_or_closer() -> None:
