@@ -15,6 +15,9 @@ from torch import Tensor
 from .geometry import Pinhole, inside, project, sample_image
 from .grid import node_positions, spacing
 
+_BESIDE = 0.1
+"""Confidence of all points of a place that halves their weight, if their errors are correlated."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class PointDistances:
@@ -58,10 +61,14 @@ def merged_points(
     normals: Float[Tensor, "points 3"],
     confidence: Float[Tensor, "points"],
     cell: float,
+    *,
+    correlated: bool = False,
 ) -> tuple[Float[Tensor, "merged 3"], Float[Tensor, "merged 3"], Float[Tensor, "merged"]]:
     """Points that share a cube of side `cell` and face the same way as one: means, and the confidence's sum.
 
-    The same way is the same side of a die, so that the two faces of a thin sheet stay apart.
+    The same way is the same side of a die, so that the two faces of a thin sheet stay apart. If the errors
+    of neighbours are `correlated`, more points are not more evidence: the confidence is the mean, in which
+    each counts by itself, and less where next to nothing stands beside a point.
     """
     place = (positions / cell).floor().long()
     place -= place.amin(dim=0)
@@ -70,12 +77,16 @@ def merged_points(
     size = place.amax(dim=0) + 1
     key = ((place[:, 0] * size[1] + place[:, 1]) * size[2] + place[:, 2]) * 6 + side
     cubes, cube_of = torch.unique(key, return_inverse=True)
-    weighted = (
-        torch.cat([positions, normals, torch.ones_like(positions[:, :1])], dim=-1) * confidence[:, None]
-    )
-    sums = positions.new_zeros((len(cubes), 7)).index_add_(0, cube_of, weighted)
+    one = torch.ones_like(confidence)
+    weighted = torch.column_stack([positions, normals, one, confidence]) * confidence[:, None]
+    sums = positions.new_zeros((len(cubes), 8)).index_add_(0, cube_of, weighted)
     kept = sums[sums[:, 6] > 0]
-    return kept[:, :3] / kept[:, 6:], F.normalize(kept[:, 3:6], dim=-1), kept[:, 6]
+    total = kept[:, 6]
+    return (
+        kept[:, :3] / total[:, None],
+        F.normalize(kept[:, 3:6], dim=-1),
+        kept[:, 7] / (total + _BESIDE) if correlated else total,
+    )
 
 
 def half_cell_px(camera: Pinhole, nodes: int) -> int:

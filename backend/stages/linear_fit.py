@@ -59,7 +59,8 @@ def fit_level(
     """
     nodes = before.shape[0]
     h = spacing(nodes)
-    points = merged_points(scene.positions, scene.normals, scene.confidence**3, h / 2)
+    # neighbouring pixels are matched by nearly the same windows: their errors are one error
+    points = merged_points(scene.positions, scene.normals, scene.confidence**3, h / 2, correlated=True)
     measured = point_distances(*points, nodes)
     measured_weight = measured.weight.clamp(max=4.0)
     ball = ball_behind(scene, radius, nodes)
