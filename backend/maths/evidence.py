@@ -15,9 +15,6 @@ from torch import Tensor
 from .geometry import Pinhole, inside, project, sample_image
 from .grid import node_positions, spacing
 
-_BESIDE = 0.1
-"""Confidence of all points of a place that halves their weight, if their errors are correlated."""
-
 
 @dataclass(frozen=True, kw_only=True)
 class PointDistances:
@@ -68,7 +65,7 @@ def merged_points(
 
     The same way is the same side of a die, so that the two faces of a thin sheet stay apart. If the errors
     of neighbours are `correlated`, more points are not more evidence: the confidence is the mean, in which
-    each counts by itself, and less where next to nothing stands beside a point.
+    each counts by itself.
     """
     place = (positions / cell).floor().long()
     place -= place.amin(dim=0)
@@ -85,7 +82,7 @@ def merged_points(
     return (
         kept[:, :3] / total[:, None],
         F.normalize(kept[:, 3:6], dim=-1),
-        kept[:, 7] / (total + _BESIDE) if correlated else total,
+        kept[:, 7] / total if correlated else total,
     )
 
 

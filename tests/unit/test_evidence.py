@@ -160,20 +160,18 @@ def test_merged_points_match_the_definition(cell: float) -> None:
 
 
 def test_points_with_one_error_count_as_one_measurement() -> None:
-    """A hundred times as many say hardly more, a surer one more; places and normals are the same mean."""
+    """Many say no more than one, a surer one beside them does; places and normals are the same means."""
     points = oriented_points(3000)
     alone, apart = merged_points(*points, 0.3), merged_points(*points, 0.3, correlated=True)
     torch.testing.assert_close(apart[:2], alone[:2])
 
-    def together(confidence: float, count: int) -> float:
+    def together(*confidence: float) -> float:
+        count = len(confidence)
         position, normal = torch.full((count, 3), 0.5), torch.tensor([[0.0, 0.0, 1.0]]).repeat(count, 1)
-        each = torch.full((count,), confidence)
-        return float(merged_points(position, normal, each, 1.0, correlated=True)[2])
+        return float(merged_points(position, normal, torch.tensor(confidence), 1.0, correlated=True)[2])
 
-    assert together(0.5, 400) == pytest.approx(0.5, rel=1e-3)
-    assert together(0.5, 4) == pytest.approx(0.5 * 2 / 2.1)
-    assert together(0.05, 4000) == pytest.approx(0.05, rel=1e-3)
-    assert together(0.1, 1) == pytest.approx(0.05)
+    assert together(*[0.5] * 400) == pytest.approx(together(0.5)) == pytest.approx(0.5)
+    assert together(0.1, 0.9) == pytest.approx((0.1 * 0.1 + 0.9 * 0.9) / (0.1 + 0.9))
 
 
 def test_the_order_of_points_does_not_matter() -> None:
