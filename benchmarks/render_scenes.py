@@ -39,10 +39,8 @@ def render_words(case: Case, output: Path, data: Path | None) -> tuple[str, ...]
 def fingerprint(words: tuple[str, ...]) -> str:
     """Changes with the options and with the code that renders."""
     digest = hashlib.sha256(repr(words).encode())
-    scenes = sorted((ROOT / "blender_scenes").glob("*.py"))
-    sources = [path for path in scenes if path.name != NO_PICTURES]
-    sources.append(ROOT / "addon" / "view_layout.py")
-    for path in sources:
+    scenes = {*(ROOT / "blender_scenes").glob("*.py")} - {ROOT / "blender_scenes" / NO_PICTURES}
+    for path in (*sorted(scenes), ROOT / "addon" / "view_layout.py"):
         digest.update(path.read_bytes())
     return digest.hexdigest()
 
