@@ -13,9 +13,19 @@ _registered = ExitStack()
 def _modules() -> tuple[ModuleType, ...]:
     """Those with something to register, in an order in which each finds what it refers to."""
     from . import command_line, handlers, panels, preferences, properties
-    from .operators import cameras, environment, images, points, reconstruct, region, result, views
+    from .operators import (
+        cameras,
+        environment,
+        images,
+        novel_views,
+        points,
+        reconstruct,
+        region,
+        result,
+        views,
+    )
 
-    operators = (environment, images, views, cameras, region, reconstruct, result, points)
+    operators = (environment, images, views, cameras, region, reconstruct, result, novel_views, points)
     return (preferences, properties, *operators, panels, command_line, handlers)
 
 

@@ -27,7 +27,7 @@ from .scenes import scene_named
 from .solved import SolvedCamera, SolvedScene, read_solved
 
 JOB, ROLE, PHOTO, SIZE = "fewview_job", "fewview_role", "fewview_photo", "fewview_size"
-UPRIGHT = "fewview_upright"
+UPRIGHT, BAKED = "fewview_upright", "fewview_baked"
 """Names of the custom properties."""
 ROOT, CAMERA, POINTS = "root", "camera", "points"
 """Values of `fewview_role`."""
@@ -128,7 +128,7 @@ def world_from_solved(root: bpy.types.Object | None) -> NDArray[np.float64]:
     """
     if root is None:
         return np.eye(4)
-    return np.array(root.matrix_world, np.float64) @ _upright_from_solved(root)
+    return np.array(root.matrix_world, np.float64) @ kept_similarity(root, UPRIGHT)
 
 
 def cameras_with_photographs(scene: bpy.types.Scene) -> list[bpy.types.Object]:
@@ -230,18 +230,23 @@ def _hang(
 ) -> None:
     """Put the object where it belongs, under the root; a camera keeps its own size."""
     made.parent = root
-    root_from_object = _upright_from_solved(root) @ solved_from_object
+    root_from_object = kept_similarity(root, UPRIGHT) @ solved_from_object
     if made.type == "CAMERA":
         root_from_object[:3, :3] /= np.cbrt(np.linalg.det(root_from_object[:3, :3]))
     made.matrix_basis = Matrix(root_from_object.tolist())
 
 
-def _upright_from_solved(root: bpy.types.Object | None) -> NDArray[np.float64]:
-    """(4, 4) similarity that the root keeps; the identity where there is none, or the user has removed it."""
-    kept = None if root is None else root.get(UPRIGHT)
+def kept_similarity(made: bpy.types.Object | None, name: str) -> NDArray[np.float64]:
+    """(4, 4) that the object keeps; the identity where there is none, or the user has removed it."""
+    kept = None if made is None else made.get(name)
     if kept is None or len(kept) != 16:
         return np.eye(4)
     return np.array(kept, np.float64).reshape(4, 4)
+
+
+def selected_cameras(view_layer: bpy.types.ViewLayer) -> list[bpy.types.Object]:
+    """Of any origin."""
+    return [made for made in view_layer.objects if made.type == "CAMERA" and made.select_get()]
 
 
 def _set_sizes(camera: bpy.types.Object, root: bpy.types.Object | None, solved: SolvedScene) -> None:
@@ -249,7 +254,7 @@ def _set_sizes(camera: bpy.types.Object, root: bpy.types.Object | None, solved: 
     scale = float(np.cbrt(abs(np.linalg.det(world_from_solved(root)[:3, :3]))))
     size = _size_solved(solved) * scale
     centre = np.append(_centre(solved), 1.0)
-    centre_root = (_upright_from_solved(root) @ centre)[:3]
+    centre_root = (kept_similarity(root, UPRIGHT) @ centre)[:3]
     distance = float(np.linalg.norm(np.array(camera.matrix_basis.translation) - centre_root))
     distance *= 1.0 if root is None else max(map(abs, root.matrix_world.to_scale()))
     camera.data.display_size = 0.3 * size

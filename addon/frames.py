@@ -10,8 +10,10 @@ import bpy
 import numpy as np
 from numpy.typing import NDArray
 
-from .camera_objects import root_or_none, world_from_solved
-from .job_folder import CAMERAS, JOB_FILE, RESULT, PastJob
+from .camera_objects import BAKED, kept_similarity, root_or_none, world_from_solved
+from .job_folder import CAMERAS, JOB_FILE, MESH, RESULT, PastJob, inside
+from .placing import similarity_between
+from .ply import read_ply
 
 
 def frame_owner(job: PastJob) -> Path:
@@ -36,3 +38,28 @@ def world_from_solved_or_none(scene: bpy.types.Scene, job: PastJob) -> NDArray[n
         return np.eye(4)
     root = root_or_none(scene, str(owner.absolute()))
     return None if root is None else world_from_solved(root)
+
+
+def world_from_result(result: bpy.types.Object, folder: Path) -> NDArray[np.float64]:
+    """(4, 4): where the frame of a job's files lies in the scene, as its imported mesh is placed now.
+
+    As long as the mesh has the vertices of the job's file, they tell it, so that a transform that was
+    applied counts; after a remesh, what the import kept. Raises ValueError where the mesh has become
+    another, or the file is damaged, OSError where it cannot be read.
+    """
+    path = inside(folder, folder / RESULT / MESH)
+    solved = read_ply(path).positions if path.is_file() else np.empty((0, 3))
+    return np.array(result.matrix_world, np.float64) @ _object_from_solved(result, solved)
+
+
+def _object_from_solved(result: bpy.types.Object, solved: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(4, 4), by the positions (vertices, 3) of the job's mesh."""
+    if not len(solved) or len(solved) != len(result.data.vertices):
+        return kept_similarity(result, BAKED)
+    flat = np.empty(3 * len(solved), np.float32)
+    result.data.attributes["position"].data.foreach_get("vector", flat)
+    try:
+        return similarity_between(solved, flat.reshape(-1, 3).astype(np.float64))
+    except ValueError as error:
+        text = f"{result.name} has another shape than the job's mesh: import it again from Past Jobs"
+        raise ValueError(text) from error

@@ -70,6 +70,8 @@ def draw_ended(layout: bpy.types.UILayout, context: bpy.types.Context, end: jobs
     if end.failure is not None and not end.cancelled:
         draw_text(layout, context, end.failure.text.partition("\n")[0])
         draw_text(layout, context, end.failure.remedy, icon="FORWARD")
+    for text in end.notes:
+        draw_text(layout, context, text)
     for text in end.warnings[:3]:
         draw_text(layout, context, text, icon="ERROR")
     if end.failure is not None and not end.cancelled:

@@ -3,6 +3,7 @@
     PARENT/reconstruct-001/     job.json      what was asked for
                                 backend.log   what the backend's libraries said
                                 result/       the backend's own folder: mesh.ply, cameras.json
+                                novel-views-001/   of Blender's cameras: images/, transforms.json, backend.log
     PARENT/views-001/           rendered views: images/, transforms.json, truth.ply
     PARENT/points-001/          cloud.ply     points alone
                                 backend.log, result/
@@ -17,9 +18,11 @@ from pathlib import Path
 from ..backend.wire.protocol import Job, ProtocolError, decode_job, encode_job
 
 JOB_FILE, LOG, RESULT, CLOUD = "job.json", "backend.log", "result", "cloud.ply"
-MESH, CAMERAS, REPORT_PAGE, REPORT_NUMBERS, SPARSE = (
+MESH, RADIANCE, CAMERAS, CAMERAS_PAGE, REPORT_PAGE, REPORT_NUMBERS, SPARSE = (
     "mesh.ply",
+    "radiance.npz",
     "cameras.json",
+    "cameras.html",
     "report.html",
     "report.json",
     "sparse.ply",
@@ -98,6 +101,11 @@ def read_job(folder: Path) -> PastJob:
 def has_fit(folder: Path) -> bool:
     """Whether it is a folder of points with the surface that was fitted to them; such have no job.json."""
     return (folder / CLOUD).is_file() and (folder / RESULT / MESH).is_file()
+
+
+def can_be_rendered(folder: Path) -> bool:
+    """Whether the folder of a job holds what the backend renders from cameras."""
+    return any((folder / RESULT / name).is_file() for name in (MESH, RADIANCE))
 
 
 def past_jobs(parent: Path) -> tuple[PastJob, ...]:

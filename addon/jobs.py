@@ -69,6 +69,8 @@ class RunningJob:
     """Of the stage."""
     text: str = ""
     warnings: list[str] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
+    """What the user should know where all is well."""
     checks: list[Checked] = field(default_factory=list)
     cancelling: bool = False
     heard_s: float = field(default_factory=time.monotonic)
@@ -104,6 +106,7 @@ class EndedJob:
     checks: tuple[Checked, ...]
     log_path: Path
     seconds: float
+    notes: tuple[str, ...] = ()
 
     @property
     def cancelled(self) -> bool:
@@ -180,6 +183,8 @@ def follow(operator: bpy.types.Operator) -> set[str]:
     end = wait()
     for text in end.warnings:
         operator.report({"WARNING"}, text)
+    for text in end.notes:
+        operator.report({"INFO"}, text)
     if end.failure is None:
         return {"FINISHED"}
     operator.report({"ERROR"}, f"{end.failure.text} {end.failure.remedy}".strip())
@@ -360,5 +365,6 @@ def _end(job: RunningJob, failure: Failed | None) -> None:
         checks=tuple(job.checks),
         log_path=job.log_path,
         seconds=job.elapsed_s,
+        notes=tuple(job.notes),
     )
     redraw()

@@ -19,7 +19,7 @@ from mathutils import Matrix
 from numpy.typing import NDArray
 
 from . import colours
-from .camera_objects import JOB, ROLE
+from .camera_objects import BAKED, JOB, ROLE
 from .heat_map import SUPPORT
 from .mesh_arrays import MeshArrays, mesh_arrays
 from .ply import PlyMesh, read_ply
@@ -205,6 +205,7 @@ def _show_result(uid: int, arrays: MeshArrays, wanted: MeshImport) -> None:
     remove_preview()
     made = bpy.data.objects.new(mesh.name, mesh)
     made[JOB], made[ROLE] = wanted.job, MESH
+    made[BAKED] = wanted.world_from_solved.ravel().tolist()
     scene.collection.objects.link(made)
     parent = next((o for o in scene.objects if o.session_uid == wanted.parent_uid), None)
     if parent is not None:

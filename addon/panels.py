@@ -12,10 +12,11 @@ from .drawing import draw_button, draw_state, draw_text
 from .environment import State
 from .error_map import numbers_of
 from .job_boxes import draw_ended, draw_environment, draw_running
-from .job_folder import past_jobs
+from .job_folder import can_be_rendered, past_jobs
 from .operators.environment import backend_state
 from .operators.images import list_problems
 from .operators.reconstruct import jobs_parent
+from .operators.result_files import camera_page_or_none
 from .properties import settings_of
 from .result_mesh import result_or_none
 from .result_numbers import result_lines
@@ -69,7 +70,7 @@ class FEWVIEW_PT_main(_Panel, bpy.types.Panel):
         job, end = jobs.running(), jobs.ended()
         if job is not None:
             draw_running(self.layout.box(), context, job)
-        elif end is not None and (end.failure is not None or end.warnings):
+        elif end is not None and (end.failure is not None or end.warnings or end.notes):
             draw_ended(self.layout.box(), context, end)
         if job is None and backend_state(context)[0] is State.NOT_READY:
             draw_environment(self.layout.box(), context)
@@ -151,6 +152,7 @@ class FEWVIEW_PT_cameras(_Step, bpy.types.Panel):
         row.operator("fewview.remove_cameras", icon="X", text="")
         if solved.reprojection_error_px is not None:
             layout.label(text=f"Accurate to {solved.reprojection_error_px:.1f} pixels")
+        _draw_camera_report(layout, context)
         for name, why in solved.unplaced:
             box = layout.box()
             box.label(text=f"{name} could not be placed", icon="ERROR")
@@ -264,7 +266,10 @@ class FEWVIEW_PT_result(_Step, bpy.types.Panel):
         row.operator("fewview.decimate", text="Decimate")
         column.operator("fewview.remesh", icon="MOD_REMESH")
         column.operator("fewview.export", icon="EXPORT")
+        if folder and can_be_rendered(Path(folder)):
+            column.operator("fewview.render_novel_views", icon="RENDER_STILL")
         column.operator("fewview.open_report", icon="URL")
+        _draw_camera_report(column, context)
         column.operator("fewview.open_folder", icon="FILE_FOLDER")
 
 
@@ -302,6 +307,11 @@ class FEWVIEW_PT_points(_Panel, bpy.types.Panel):
         column.prop(settings, "point_method")
         column.prop(settings, "point_normals")
         layout.operator("fewview.fit_points", icon="OUTLINER_OB_POINTCLOUD")
+
+
+def _draw_camera_report(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
+    if camera_page_or_none(context) is not None:
+        layout.operator("fewview.open_camera_report", icon="URL")
 
 
 def _draw_render(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:

@@ -17,6 +17,9 @@ _RESIDUALS = (0.5, 0.35, 0.25, 0.17, 0.12, 0.1, 0.1, 0.1)
 _TIE = 1e-3
 """Of the backwards axes beside the y axes: decides for cameras that look straight down."""
 _FEWEST_POINTS = 20
+_UNEVEN = 1e-4
+"""Relative difference of squared scales; Blender's transforms have seven digits."""
+_ALIKE = 0.01
 _LOW = 0.02
 """Share of points that may lie under the floor: they are the wrong ones."""
 
@@ -97,6 +100,46 @@ def inverse_similarity(b_from_a: Array) -> Array:
         raise ValueError("the placement cannot be turned back: one of its scales is 0")
     inverse: Array = np.asarray(np.linalg.inv(matrix), np.float64)
     return inverse
+
+
+def solved_from_camera(world_from_solved: Array, world_from_camera: Array) -> Array:
+    """(4, 4): a camera's pose in the frame that was solved, a rotation and a translation.
+
+    It sees there what the camera sees in the world. Raises ValueError where the frame is mirrored, or
+    scaled differently along its axes or by 0: then no pinhole does.
+    """
+    solved_from_world = inverse_similarity(world_from_solved)
+    linear = np.asarray(world_from_solved, np.float64)[:3, :3]
+    scale = float(np.cbrt(np.linalg.det(linear)))
+    if scale < 0 or np.abs(linear.T @ linear / scale**2 - np.eye(3)).max() > _UNEVEN:
+        raise ValueError("it is mirrored, or scaled differently along its axes: give it one positive scale")
+    pose: Array = solved_from_world @ world_from_camera
+    pose[:3, :3] *= scale
+    return pose
+
+
+def similarity_between(points_a: Array, points_b: Array) -> Array:
+    """(4, 4): b_from_a, the similarity that brings points (points, 3) nearest to others, one by one.
+
+    In least squares, without mirroring (Umeyama, Least-Squares Estimation of Transformation Parameters
+    Between Two Point Patterns, 1991). Raises ValueError where half of the points stay farther away than
+    1 % of the mean distance from their middle: no similarity made one of the other.
+    """
+    mean_a, mean_b = points_a.mean(axis=0), points_b.mean(axis=0)
+    from_a, from_b = points_a - mean_a, points_b - mean_b
+    if not from_a.any():
+        raise ValueError("the points lie all in one place")
+    left, stretches, right = np.linalg.svd(from_b.T @ from_a)
+    signs = np.array([1.0, 1.0, np.sign(np.linalg.det(left @ right))])
+    rotation = (left * signs) @ right
+    scale = float(stretches @ signs) / float((from_a**2).sum())
+    off = np.linalg.norm(from_b - scale * from_a @ rotation.T, axis=1)
+    if not np.median(off) < _ALIKE * np.linalg.norm(from_b, axis=1).mean():
+        raise ValueError("the points do not have the same shape")
+    b_from_a = np.eye(4)
+    b_from_a[:3, :3] = scale * rotation
+    b_from_a[:3, 3] = mean_b - b_from_a[:3, :3] @ mean_a
+    return b_from_a
 
 
 def sphere_around(points: Array, weights: Array | None = None) -> tuple[Array, float]:

@@ -1,10 +1,12 @@
-"""The cameras that the backend found, read from its cameras.json; no Blender needed.
+"""Cameras in files: those that the backend found, in its cameras.json, and those that it is given; no Blender
+needed.
 
 The file is nerfstudio's transforms.json with one object more, "fewview". It is read as one that a stranger
 may have written: every number is checked before anything is made from it.
 """
 
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -25,10 +27,10 @@ _ROTATION_TOLERANCE = 1e-4
 
 @dataclass(frozen=True, kw_only=True)
 class SolvedCamera:
-    """A photograph and the camera that took it, without lens distortion."""
+    """A picture and the camera that took it, without lens distortion."""
 
     name: str
-    """Of the photograph."""
+    """Of the picture."""
     world_from_camera: NDArray[np.float64]
     """(4, 4), a rotation and a translation; camera axes as in OpenGL and Blender."""
     pinhole: Pinhole
@@ -70,6 +72,28 @@ def read_solved(path: Path) -> SolvedScene:
         return _scene(content)
     except ValueError as error:
         raise ValueError(f"{path.name}: {error}") from error
+
+
+def write_cameras(path: Path, cameras: Sequence[SolvedCamera]) -> None:
+    """Write a transforms.json that `read_solved` reads again; another file of this name is replaced."""
+    part = path.with_suffix(".part")
+    content = {"camera_model": "PINHOLE", "frames": [_frame(camera) for camera in cameras]}
+    part.write_text(json.dumps(content, indent=2, allow_nan=False) + "\n", encoding="utf-8")
+    part.replace(path)
+
+
+def _frame(camera: SolvedCamera) -> dict[str, Any]:
+    pinhole = camera.pinhole
+    return {
+        "file_path": camera.name,
+        "w": pinhole.width,
+        "h": pinhole.height,
+        "fl_x": pinhole.fx_px,
+        "fl_y": pinhole.fy_px,
+        "cx": pinhole.cx_px,
+        "cy": pinhole.cy_px,
+        "transform_matrix": camera.world_from_camera.tolist(),
+    }
 
 
 def _scene(content: object) -> SolvedScene:

@@ -11,13 +11,13 @@ from collections.abc import Generator, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
 
 import bpy
 
 from .camera_lens import pinhole_of, world_from_camera
 from .kept_settings import Change, changed
 from .png import critical_chunks
+from .solved import SolvedCamera, write_cameras
 from .true_mesh import TrueMesh, subject_of, true_mesh, write_ply
 
 IMAGES, TRANSFORMS, TRUTH = "images", "transforms.json", "truth.ply"
@@ -79,7 +79,7 @@ def render_views(request: ViewRequest, folder: Path) -> Generator[tuple[int, Pat
     subject = () if request.target is None else _subject(_object(scene, request.target))
     cameras = [_object(scene, view.camera) for view in request.views if view.camera]
     (folder / IMAGES).mkdir(parents=True)
-    frames: list[dict[str, Any]] = []
+    taken: list[SolvedCamera] = []
     engine = ENGINES.get(request.engine, scene.render.engine)
     changes = (
         *render_changes(scene, request),
@@ -93,11 +93,11 @@ def render_views(request: ViewRequest, folder: Path) -> Generator[tuple[int, Pat
             if index == 0 and subject:
                 truth = _truth(subject)
             path = folder / IMAGES / f"{index:03d}.png"
-            frames.append(_take(scene, path, noise_seed=index))
+            taken.append(_take(scene, path, noise_seed=index))
             yield index, path
     if subject:
         write_ply(folder / TRUTH, truth)
-    _write_transforms(folder / TRANSFORMS, frames)
+    write_cameras(folder / TRANSFORMS, taken)
 
 
 def render_changes(scene: bpy.types.Scene, request: ViewRequest) -> tuple[Change, ...]:
@@ -205,8 +205,8 @@ def _go_to(scene: bpy.types.Scene, view: View) -> None:
     bpy.context.view_layer.update()
 
 
-def _take(scene: bpy.types.Scene, path: Path, *, noise_seed: int) -> dict[str, Any]:
-    """Render what the scene's camera sees to the file; its entry in transforms.json."""
+def _take(scene: bpy.types.Scene, path: Path, *, noise_seed: int) -> SolvedCamera:
+    """Render what the scene's camera sees to the file; that camera."""
     if hasattr(scene, "cycles"):
         scene.cycles.seed = noise_seed
     camera = scene.camera
@@ -218,16 +218,7 @@ def _take(scene: bpy.types.Scene, path: Path, *, noise_seed: int) -> dict[str, A
         raise RuntimeError(f"Blender rendered no picture from {camera.name}")
     part.write_bytes(critical_chunks(part.read_bytes()))
     part.replace(path)
-    return {
-        "file_path": f"{IMAGES}/{path.name}",
-        "w": pinhole.width,
-        "h": pinhole.height,
-        "fl_x": pinhole.fx_px,
-        "fl_y": pinhole.fy_px,
-        "cx": pinhole.cx_px,
-        "cy": pinhole.cy_px,
-        "transform_matrix": pose.tolist(),
-    }
+    return SolvedCamera(name=f"{IMAGES}/{path.name}", world_from_camera=pose, pinhole=pinhole)
 
 
 def _object(scene: bpy.types.Scene, full_name: str) -> bpy.types.Object:
@@ -248,10 +239,3 @@ def _truth(subject: tuple[bpy.types.Object, ...]) -> TrueMesh:
         return true_mesh(subject)
     except ValueError as error:
         raise ValueError(f"{subject[0].name} cannot be rendered: {error}") from error
-
-
-def _write_transforms(path: Path, frames: list[dict[str, Any]]) -> None:
-    part = path.with_suffix(".part")
-    content = {"camera_model": "PINHOLE", "frames": frames}
-    part.write_text(json.dumps(content, indent=2, allow_nan=False) + "\n", encoding="utf-8")
-    part.replace(path)

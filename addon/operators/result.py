@@ -15,7 +15,12 @@ from ..result_mesh import result_or_none
 from .measure import FEWVIEW_OT_measure_error
 from .on_result import OnResult, Status, has_result, refused, result_of
 from .reconstruct import jobs_parent
-from .result_files import FEWVIEW_OT_export, FEWVIEW_OT_open_folder, FEWVIEW_OT_open_report
+from .result_files import (
+    FEWVIEW_OT_export,
+    FEWVIEW_OT_open_camera_report,
+    FEWVIEW_OT_open_folder,
+    FEWVIEW_OT_open_report,
+)
 
 __all__ = ["CLASSES", "import_result_steps"]
 
@@ -178,5 +183,6 @@ CLASSES = (
     FEWVIEW_OT_remesh,
     FEWVIEW_OT_export,
     FEWVIEW_OT_open_report,
+    FEWVIEW_OT_open_camera_report,
     FEWVIEW_OT_open_folder,
 )

@@ -7,7 +7,17 @@ from bpy.props import BoolProperty, EnumProperty, StringProperty
 
 from .. import result_mesh
 from ..camera_objects import JOB
-from ..job_folder import REPORT_PAGE, RESULT, FolderError, has_fit, inside, past_jobs, read_job
+from ..job_folder import (
+    CAMERAS_PAGE,
+    REPORT_PAGE,
+    RESULT,
+    FolderError,
+    has_fit,
+    inside,
+    past_jobs,
+    read_job,
+)
+from ..properties import settings_of
 from ..result_mesh import result_or_none
 from .on_result import RECONSTRUCT_FIRST, OnResult, Status, refused, result_of
 from .reconstruct import jobs_parent
@@ -104,6 +114,38 @@ class FEWVIEW_OT_open_report(_OnFolder, bpy.types.Operator):
             bpy.ops.wm.url_open(url=page.as_uri())
         except (FolderError, RuntimeError) as error:
             return refused(self, error)
+        return {"FINISHED"}
+
+
+def camera_page_or_none(context: bpy.types.Context) -> Path | None:
+    """What the job that found the cameras alone tells of them; None where there was none, or it is gone."""
+    chosen = settings_of(context).cameras_job
+    folder = Path(bpy.path.abspath(chosen))
+    try:
+        page = inside(folder, folder / RESULT / CAMERAS_PAGE)
+        return page if chosen and page.is_file() else None
+    except (FolderError, OSError):
+        return None
+
+
+class FEWVIEW_OT_open_camera_report(bpy.types.Operator):
+    """Open in a web browser what is known of the cameras: who matches whom, how sure each of them is"""
+
+    bl_idname = "fewview.open_camera_report"
+    bl_label = "Open Camera Report"
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        page = camera_page_or_none(context)
+        if page is None:
+            cls.poll_message_set("Estimate the cameras in step 2 first")
+        return page is not None
+
+    def execute(self, context: bpy.types.Context) -> Status:
+        page = camera_page_or_none(context)
+        if page is None:
+            return refused(self, FolderError("The report of the cameras is gone"))
+        bpy.ops.wm.url_open(url=page.as_uri())
         return {"FINISHED"}
 
 

@@ -11,6 +11,7 @@ from bpy.props import StringProperty
 
 from .. import jobs, render_worker, undo_step, view_cameras
 from ..arguments import argument, fill_in
+from ..camera_objects import selected_cameras
 from ..job_folder import new_folder
 from ..properties import FEWVIEW_PG_settings, settings_of
 from ..scenes import in_scene, scene_name_of
@@ -237,9 +238,7 @@ def _views(context: bpy.types.Context, source: str, frame_step: int) -> tuple[Vi
                 for frame in range(scene.frame_start, scene.frame_end + 1, frame_step)
             )
         case "SELECTED":
-            cameras = [
-                made for made in context.view_layer.objects if made.select_get() and made.type == "CAMERA"
-            ]
+            cameras = selected_cameras(context.view_layer)
             remedy = "No camera is selected: select those to render from"
         case _:
             cameras = view_cameras.generated(scene)

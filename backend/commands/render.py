@@ -1,15 +1,17 @@
-"""The command that renders a finished job from given cameras, for a person on a terminal."""
+"""The command that renders a finished job from given cameras, for a terminal or for a program on the wire."""
 
 import argparse
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ..wire.protocol import DEVICES
-from .reconstruct import with_terminal
+from ..wire import protocol
+from ..wire.speaker import Speaker
+from .cancelling import CancelRequest, catch_signals
+from .reconstruct import converse, say_last, with_terminal
 
 if TYPE_CHECKING:
-    from ..terminal import TerminalListener
+    from ..pipeline import Listener, Outcome
 
 
 def add_render(parser: argparse.ArgumentParser) -> None:
@@ -24,24 +26,48 @@ def add_render(parser: argparse.ArgumentParser) -> None:
         help="transforms.json or COLMAP model in the job's frame; no pictures are needed",
     )
     add("--output", metavar="DIR", type=Path, required=True, help="new or empty folder, or one rendered into")
-    add("--device", choices=DEVICES, default="auto", help="where to compute (auto)")
+    add("--device", choices=protocol.DEVICES, default="auto", help="where to compute (auto)")
+    add("--wire", action="store_true", help="for programs: messages on stdout")
 
 
 def render(parsed: argparse.Namespace) -> int:
-    """Render with progress on stderr and the names of the pictures on stdout; the exit code."""
+    """Render and say which pictures there are; the exit code."""
+    return _on_wire(parsed) if parsed.wire else _on_terminal(parsed)
+
+
+def _on_terminal(parsed: argparse.Namespace) -> int:
     return with_terminal(
-        lambda listener: _render(parsed, listener),
-        cancelled=lambda listener: listener.warned("stopped; no picture was written."),
+        lambda listener: listener.finished(parsed.output, _render(parsed, listener)),
+        cancelled=lambda listener: listener.warned(_cancelled().text),
     )
 
 
-def _render(parsed: argparse.Namespace, listener: "TerminalListener") -> None:
+def _on_wire(parsed: argparse.Namespace) -> int:
+    from .wire_listener import WireListener
+
+    def work(request: CancelRequest, speaking: Speaker) -> None:
+        outcome = _render(parsed, WireListener(request, speaking))
+        say_last(speaking, protocol.Finished(output=str(parsed.output), files=outcome.files))
+
+    return converse(work, _cancelled())
+
+
+def _cancelled() -> protocol.Failed:
+    return protocol.Failed(
+        code=protocol.CANCELLED,
+        text="The rendering was stopped; no picture was written.",
+        remedy="Start it again.",
+    )
+
+
+def _render(parsed: argparse.Namespace, listener: "Listener") -> "Outcome":
     from ..pipeline import Outcome  # torch may be missing, and doctor must still start
     from ..rendering import render_job
     from ..workspace import StageCost
 
+    catch_signals()
     listener.stage_started("render", 1, 1)
     began_s = time.perf_counter()
     names = render_job(parsed.job, parsed.cameras, parsed.output, parsed.device, listener.progressed)
     listener.stage_finished(StageCost(seconds=time.perf_counter() - began_s, peak_memory_bytes=None))
-    listener.finished(parsed.output, Outcome(files=names, summary=()))
+    return Outcome(files=names, summary=())

@@ -113,7 +113,9 @@ class Sidebar:
         self.patch.setattr(jobs, "_running", job)
         return job
 
-    def ended(self, *, failure: Any = None, warnings: tuple[str, ...] = ()) -> None:
+    def ended(
+        self, *, failure: Any = None, warnings: tuple[str, ...] = (), notes: tuple[str, ...] = ()
+    ) -> None:
         """A job has ended so."""
         jobs = self.part("jobs")
         end = jobs.EndedJob(
@@ -123,6 +125,7 @@ class Sidebar:
             checks=(),
             log_path=self.folder / "log",
             seconds=1.0,
+            notes=notes,
         )
         self.patch.setattr(jobs, "_ended", end)
 
@@ -529,6 +532,8 @@ def test_a_job_that_was_cancelled(sidebar: Sidebar) -> None:
 def test_a_job_that_ended_well(sidebar: Sidebar) -> None:
     sidebar.ended(warnings=("dark.jpg is dark",))
     assert sidebar.draw_all()["FEWVIEW_PT_main"].texts() == ["Reconstructing is done", "dark.jpg is dark"]
+    sidebar.ended(notes=("3 pictures",))
+    assert sidebar.draw_all()["FEWVIEW_PT_main"].texts() == ["Reconstructing is done", "3 pictures"]
     sidebar.ended()
     assert sidebar.draw_all()["FEWVIEW_PT_main"].drawn == []
 
@@ -551,6 +556,27 @@ def test_a_result_and_what_can_be_done_with_it(sidebar: Sidebar) -> None:
     texts = " ".join(sidebar.draw_all()["FEWVIEW_PT_result"].texts())
     assert sidebar.part("heat_map").SUPPORT.legend in texts
     assert not bpy.ops.fewview.show_error.poll()
+
+
+@pytest.mark.parametrize("name", ["mesh.ply", "radiance.npz"])
+def test_a_result_with_its_files_can_be_rendered(sidebar: Sidebar, name: str) -> None:
+    sidebar.result()
+    path = sidebar.folder / "job" / "result" / name
+    path.parent.mkdir(parents=True)
+    path.touch()
+    assert "fewview.render_novel_views" in sidebar.draw_all()["FEWVIEW_PT_result"].operators()
+    path.unlink()
+    assert "fewview.render_novel_views" not in sidebar.draw_all()["FEWVIEW_PT_result"].operators()
+
+
+def test_the_report_of_the_cameras_has_a_button_while_it_is_there(sidebar: Sidebar) -> None:
+    page = sidebar.solved().with_name("cameras.html")
+    sidebar.result()
+    steps = ("FEWVIEW_PT_cameras", "FEWVIEW_PT_result")
+    for there in (True, False):
+        page.touch() if there else page.unlink()
+        found = sidebar.draw_all()
+        assert ["fewview.open_camera_report" in found[step].operators() for step in steps] == [there] * 2
 
 
 def test_a_result_without_colours_and_support(sidebar: Sidebar) -> None:

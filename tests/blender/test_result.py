@@ -623,6 +623,25 @@ def test_the_report_is_opened(make_job: JobMaker, monkeypatch: pytest.MonkeyPatc
         bpy.ops.fewview.open_report()
 
 
+def test_the_report_of_the_cameras_is_opened(make_job: JobMaker, monkeypatch: pytest.MonkeyPatch) -> None:
+    import webbrowser
+
+    opened: list[str] = []
+    monkeypatch.setattr(webbrowser, "open", lambda url, *_: opened.append(url))
+    page = make_job() / "result/cameras.html"
+    with pytest.raises(RuntimeError, match="Estimate the cameras"):
+        bpy.ops.fewview.open_camera_report()
+    bpy.context.scene.fewview.cameras_job = str(page.parent.parent)
+    with pytest.raises(RuntimeError, match="Estimate the cameras"):
+        bpy.ops.fewview.open_camera_report()
+    page.write_text("<p>A report</p>")
+    bpy.ops.fewview.open_camera_report()
+    assert opened == [page.as_uri()]
+    page.unlink()
+    page.symlink_to("/etc/hostname")
+    assert not bpy.ops.fewview.open_camera_report.poll()
+
+
 def test_without_a_result_buttons_say_what_to_do() -> None:
     for name in (
         "show_colour",
@@ -632,6 +651,7 @@ def test_without_a_result_buttons_say_what_to_do() -> None:
         "decimate",
         "remesh",
         "export",
+        "render_novel_views",
     ):
         with pytest.raises(RuntimeError, match="Reconstruct first"):
             getattr(bpy.ops.fewview, name)()

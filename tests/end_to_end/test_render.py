@@ -23,6 +23,8 @@ from backend.scene import SurfaceMesh, no_progress
 from backend.stages.radiance_field import Radiance, RadianceField, RadianceShape, kept, restored
 from backend.stages.radiance_image import radiance_image
 from backend.wire.client import clean_environment
+from backend.wire.protocol import Finished, Hello, Stage, decode
+from backend.wire.protocol import Progress as WireProgress
 from tests.synthetic_scene import (
     Scene,
     photographed,
@@ -191,6 +193,31 @@ def test_stopped_nothing_is_left(folder: Path) -> None:
         render_job(folder / "nerf", folder / "images" / "transforms.json", folder / "pictures", "cpu", listen)
     assert told == sorted(told)
     assert not (folder / "pictures").exists()
+
+
+def test_on_the_wire_it_names_its_pictures(folder: Path) -> None:
+    options = ["--cameras", folder / "images" / "transforms.json", "--output", folder / "pictures", "--wire"]
+    with subprocess.Popen(
+        [sys.executable, "-m", "backend", "render", folder / "surface", *options],
+        cwd=ROOT,
+        stdin=subprocess.PIPE,  # its end would stop the program
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        text=True,
+    ) as process:
+        assert process.stdout is not None
+        said = [decode(line) for line in process.stdout]
+    assert process.returncode == 0
+    assert isinstance(said[0], Hello)
+    assert [message for message in said if isinstance(message, Stage)] == [
+        Stage(name="render", index=1, count=1)
+    ]
+    shares = [message.fraction for message in said if isinstance(message, WireProgress)]
+    assert shares == sorted(shares)
+    assert shares[-1] == 1.0
+    names = tuple(f"view_{index:02d}.png" for index in range(3))
+    assert said[-1] == Finished(output=str(folder / "pictures"), files=names)
+    assert all((folder / "pictures" / name).is_file() for name in names)
 
 
 @pytest.mark.slow

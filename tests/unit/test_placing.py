@@ -8,6 +8,8 @@ import pytest
 from addon.placing import (
     Array,
     region_in_solved,
+    similarity_between,
+    solved_from_camera,
     sphere_around,
     up_direction,
     upright_from_solved,
@@ -240,3 +242,62 @@ def test_a_weighted_quantile_counts_repeated_values() -> None:
     for share in (0.01, 0.3, 0.5, 0.98, 1.0):
         expected = np.quantile(repeated, share, method="inverted_cdf")
         assert weighted_quantile(values, counts.astype(float), share) == expected
+
+
+# Cameras of the world in the frame that was solved
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_camera_sees_in_the_solved_frame_what_it_sees_in_the_world(seed: int) -> None:
+    """In its own axes each point lies in the same direction, and is nearer by the scale."""
+    rng = np.random.default_rng(seed)
+    world_from_solved = random_similarity(rng)
+    world_from_camera = np.eye(4)
+    world_from_camera[:3, :3], world_from_camera[:3, 3] = random_rotation(rng), rng.normal(size=3) * 10
+    pose = solved_from_camera(world_from_solved, world_from_camera)
+    np.testing.assert_allclose(pose[:3, :3].T @ pose[:3, :3], np.eye(3), atol=1e-12)
+    assert np.linalg.det(pose[:3, :3]) > 0
+    points = np.append(rng.normal(size=(5, 3)), np.ones((5, 1)), axis=1)
+    in_camera = points @ (np.linalg.inv(world_from_camera) @ world_from_solved).T
+    scale = np.cbrt(np.linalg.det(world_from_solved[:3, :3]))
+    in_solved_camera = points @ np.linalg.inv(pose).T
+    np.testing.assert_allclose(
+        scale * in_solved_camera[:, :3], in_camera[:, :3], rtol=1e-9, atol=1e-9 * scale
+    )
+
+
+@pytest.mark.parametrize(
+    "scales", [(1, 1, 1.01), (1, 1, -1), (-1, -1, -1), (1, 1, 0), (0, 0, 0), (np.nan, 1, 1), (np.inf, 1, 1)]
+)
+def test_no_camera_sees_what_is_stretched_or_mirrored(scales: tuple[float, float, float]) -> None:
+    world_from_solved = random_similarity(np.random.default_rng(0))
+    world_from_solved[:3, :3] *= scales
+    with pytest.raises(ValueError, match=r"one positive scale|one of its scales is 0"):
+        solved_from_camera(world_from_solved, np.eye(4))
+
+
+@pytest.mark.parametrize("flat", [False, True])
+@pytest.mark.parametrize("seed", range(4))
+def test_a_similarity_is_found_again(seed: int, flat: bool) -> None:
+    """Also where the points lie in a plane, which a mirror image fits as well; outliers do not undo it."""
+    rng = np.random.default_rng(seed)
+    points = rng.normal(size=(30, 3)) * (1, 2, 0 if flat else 3)
+    b_from_a = random_similarity(rng)
+    moved = points @ b_from_a[:3, :3].T + b_from_a[:3, 3]
+    np.testing.assert_allclose(
+        similarity_between(points, moved), b_from_a, atol=1e-12 * np.abs(b_from_a).max()
+    )
+    size = np.ptp(moved, axis=0).max()
+    noisy = moved + 3e-4 * size * rng.normal(size=moved.shape)
+    found = similarity_between(points, noisy)
+    np.testing.assert_allclose(found, b_from_a, atol=5e-3 * max(size, np.abs(b_from_a).max()))
+    assert np.linalg.det(found[:3, :3]) > 0
+
+
+def test_points_of_another_shape_are_refused() -> None:
+    points = np.random.default_rng(0).normal(size=(30, 3))
+    for other in (points * (1, 1, 1.2), points * (1, 1, -1), points[::-1], 0 * points):
+        with pytest.raises(ValueError, match="same shape"):
+            similarity_between(points, other)
+    with pytest.raises(ValueError, match="all in one place"):
+        similarity_between(0 * points, points)

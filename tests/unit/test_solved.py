@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from addon.intrinsics import Pinhole
-from addon.solved import LARGEST_FILE_BYTES, MOST_CAMERAS, read_solved
+from addon.solved import LARGEST_FILE_BYTES, MOST_CAMERAS, SolvedCamera, read_solved, write_cameras
 from addon.view_layout import world_from_camera_looking_at
 
 POSE = world_from_camera_looking_at(np.array([1.0, -5.0, 2.0]), np.zeros(3))
@@ -50,6 +50,19 @@ def test_everything_in_the_file_comes_in(write: Callable[[object], Path]) -> Non
     assert (scene.estimated, scene.reprojection_error_px) == (True, 0.4)
     assert (scene.region_centre, scene.region_radius) == ((1.0, 2.0, 3.0), 0.5)
     assert scene.unplaced == (("c.jpg", "It shows nothing"),)
+
+
+def test_what_is_written_comes_in_again(tmp_path: Path) -> None:
+    lens = Pinhole(fx_px=700, fy_px=710.5, cx_px=321, cy_px=239.5, width=640, height=480)
+    written = [
+        SolvedCamera(name=f"{n}.png", world_from_camera=n * POSE + (1 - n) * np.eye(4), pinhole=lens)
+        for n in (0, 1)
+    ]
+    write_cameras(tmp_path / "transforms.json", written)
+    scene = read_solved(tmp_path / "transforms.json")
+    assert [(camera.name, camera.pinhole) for camera in scene.cameras] == [("0.png", lens), ("1.png", lens)]
+    np.testing.assert_array_equal(scene.poses, [np.eye(4), POSE])
+    assert [path.name for path in tmp_path.iterdir()] == ["transforms.json"]
 
 
 def test_a_plain_transforms_json_has_cameras_alone(write: Callable[[object], Path]) -> None:
