@@ -25,7 +25,7 @@ from .on_result import OnResult, Status, has_result, refused, result_of
 
 
 class FEWVIEW_OT_render_novel_views(OnResult, bpy.types.Operator):
-    """Draw the result as the selected cameras, or else the scene's, see it; the job's colors, no lamps"""
+    """Draw the result in the photographs' colors, as the selected cameras, or else the scene's, see it"""
 
     bl_idname = "fewview.render_novel_views"
     bl_label = "Render from Cameras"
@@ -105,7 +105,6 @@ def _as_the_job_has_them(
     """
     if not can_be_rendered(job):
         raise ValueError(f"The files of {result.name} are gone: reconstruct again")
-    context.view_layer.update()
     world_from_solved = world_from_result(result, job)
     found: list[SolvedCamera] = []
     for camera in cameras:
@@ -134,7 +133,7 @@ def _start(python: Path, job: Path, folder: Path, device: str) -> None:
 
     def on_finished(message: Finished) -> jobs.Steps:
         for name in message.files:
-            bpy.data.images.load(str(folder / IMAGES / name))
+            bpy.data.images.load(str(inside(folder, Path(message.output) / name)))
             yield
         running, number = jobs.running(), len(message.files)
         if running is not None:

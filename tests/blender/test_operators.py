@@ -66,6 +66,10 @@ class Situation:
         self.some_backend()
         self.editing()
 
+    def result_and_running(self) -> None:
+        self.result()
+        self.running()
+
     def offline(self) -> None:
         bpy.context.preferences.system.use_online_access = False
 
@@ -140,6 +144,7 @@ OPERATORS = {
         grey=((Situation.offline, "Allow Online Access"), (Situation.online_and_running, "Wait until")),
     ),
     "measure_error": Expected(undo=True, grey=ON_RESULT),
+    "open_camera_report": Expected(undo=False, grey=((Situation.nothing, "Estimate the cameras"),)),
     "open_folder": Expected(undo=False),
     "open_report": Expected(undo=False),
     "reconstruct": Expected(undo=False, grey=((Situation.running, "still running"), *NEEDS_BACKEND)),
@@ -152,6 +157,14 @@ OPERATORS = {
     "remove_image": Expected(undo=True, grey=((Situation.nothing, "Add photographs first"),)),
     "remove_region": Expected(undo=True, grey=((Situation.nothing, "no region"),)),
     "remove_views": Expected(undo=True, grey=((Situation.nothing, "no generated cameras"),)),
+    "render_novel_views": Expected(
+        undo=False,
+        grey=(
+            *ON_RESULT,
+            (Situation.result_and_running, "still running"),
+            (Situation.few_points, "files of the job are gone"),
+        ),
+    ),
     "render_views": Expected(
         undo=False, grey=((Situation.running, "Wait for"), (Situation.nothing, "Generate cameras first"))
     ),
