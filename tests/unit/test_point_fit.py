@@ -77,7 +77,7 @@ def test_a_torus_keeps_its_hole() -> None:
 
 
 def test_a_bore_seen_by_few_points_stays_open() -> None:
-    """As a scanner sees a pipe: the bore has a quarter of the density outside."""
+    """As a scanner sees a pipe: the bore has an eighth of the density outside."""
     rng = np.random.default_rng(0)
     bore, outer, half_length = 0.35, 0.6, 0.3
 
