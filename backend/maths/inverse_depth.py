@@ -8,6 +8,7 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 from jaxtyping import Bool, Float, Float32, Int, Int64
+from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 
 from .correlation import window_sum
@@ -80,6 +81,28 @@ def lowest_with_neighbours(
     before, best, after = cost.gather(-1, around).unbind(-1)
     offset = parabola_offset(before, best, after)
     return index, torch.where((index > 0) & (index < last), offset, 0.0)
+
+
+def distance_from_edges_px(
+    inverse_depth: Float[Tensor, "height width"],
+    subject: Bool[Tensor, "height width"],
+    largest_step: Float[Tensor, "height width"],
+) -> Float[Tensor, "height width"]:
+    """Distance of every pixel to the nearest that is off the subject or beside a jump; 0 on those.
+
+    A jump is where neighbours differ by more than `largest_step` of either. Without any edge it is
+    the sum of the picture's sides.
+    """
+    smooth = subject.clone()
+    for one, other in ((np.s_[1:], np.s_[:-1]), (np.s_[:, 1:], np.s_[:, :-1])):
+        change = (inverse_depth[one] - inverse_depth[other]).abs()
+        same = change <= torch.minimum(largest_step[one], largest_step[other])
+        smooth[one] &= same
+        smooth[other] &= same
+    if smooth.all():
+        return torch.full_like(inverse_depth, float(sum(smooth.shape)))
+    distance = distance_transform_edt(smooth.cpu().numpy())
+    return torch.tensor(distance, dtype=torch.float32, device=smooth.device)
 
 
 def piece_sizes(

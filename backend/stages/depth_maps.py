@@ -1,7 +1,7 @@
 """Depth maps in the making: swept where images are small, then refined and grown, finer and finer."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -20,7 +20,12 @@ from ..maths.geometry import (
     unproject,
     warp_pixels,
 )
-from ..maths.inverse_depth import fit_planes, lowest_with_neighbours, piece_sizes
+from ..maths.inverse_depth import (
+    distance_from_edges_px,
+    fit_planes,
+    lowest_with_neighbours,
+    piece_sizes,
+)
 from ..maths.semi_global import aggregate
 from ..scene import Progress, within
 from .stereo_config import StereoConfig
@@ -28,6 +33,12 @@ from .stereo_windows import Window
 
 _LEAST_FOR_A_PLANE = 12
 """Seeds in a window that make its plane worth continuing."""
+_LARGEST_STEP_PX = 2.0
+"""Of the match, from a pixel to the next, on one surface: a limit of its gradient (Burt & Julesz 1980).
+
+A patch that reaches over a jump is matched by the edge there, and what lies behind gets the depth of what
+stands before it. The subject's outline is such an edge, and another place of the surface in every view.
+"""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,6 +57,10 @@ class Measured:
     map: Map
     votes: Float[Tensor, "height width"]
     """How many views agree, the own one counted; 0 where nothing is measured."""
+    sharpness: Float[Tensor, "height width"]
+    """How much the agreement of patches drops one pixel of disparity off, to either side."""
+    from_edge_px: Float[Tensor, "height width"]
+    """Distance to the nearest pixel off the subject or beside a jump of the map; 0 there."""
 
 
 def depth_maps(
@@ -75,8 +90,8 @@ def depth_maps(
         rounds = config.growth_rounds[min(level, 2)]
         maps = _grown_together(maps, sources, nearby, rounds, config, within(tell, 0.3, 1.0))
         sharp = [_refined(m, near, [0.25, 0.125], config) for m, near in zip(maps, sources, strict=True)]
-        votes = [_measured(index, sharp, nearby, config) for index in range(len(sharp))]
-        by_size.insert(0, [Measured(map=m, votes=v) for m, v in zip(sharp, votes, strict=True)])
+        votes = [_agreement(index, sharp, nearby, config) for index in range(len(sharp))]
+        by_size.insert(0, [_measured(*one, config) for one in zip(sharp, votes, sources, strict=True)])
     return [_each_once(list(sizes)) for sizes in zip(*by_size, strict=True)]
 
 
@@ -88,7 +103,7 @@ def _each_once(sizes: list[Measured]) -> list[Measured]:
             continue  # the pyramid of another view is higher
         height, width = coarse.votes.shape
         known = F.max_pool2d(known[None, : 2 * height, : 2 * width].float(), 2)[0] > 0
-        once.append(Measured(map=coarse.map, votes=torch.where(known, 0.0, coarse.votes)))
+        once.append(replace(coarse, votes=torch.where(known, 0.0, coarse.votes)))
         known = known | (coarse.votes > 0)
     return once
 
@@ -248,6 +263,18 @@ def _refined(current: Map, sources: list[Window], steps_px: list[float], config:
     return current
 
 
+def _sharpness(
+    current: Map, step: Float[Tensor, "height width"], sources: list[Window], config: StereoConfig
+) -> Float[Tensor, "height width"]:
+    """How much less the patches agree a step to either side.
+
+    Next to nothing where an edge runs along the epipolar line, however well the patches agree.
+    """
+    beside = torch.stack([current.inverse_depth - step, current.inverse_depth, current.inverse_depth + step])
+    scores = _scores(current.window, sources, beside, config)
+    return scores[1] - 0.5 * (scores[0] + scores[2])
+
+
 def _smoothed(current: Map, radius: int) -> Float[Tensor, "height width"]:
     """Planes fitted to the better half of every neighbourhood; holes are filled from around."""
     median = _median(current.inverse_depth)
@@ -280,12 +307,29 @@ def _enlarged(current: Map, window: Window) -> Map:
 
 
 def _measured(
-    index: int, maps: list[Map], nearby: list[list[int]], config: StereoConfig
-) -> Float[Tensor, "height width"]:
-    """`_agreement` of pixels that lie in a connected piece of surface; a few alone agree by chance."""
-    votes = _agreement(index, maps, nearby, config)
-    pieces = piece_sizes(votes.cpu().numpy() > 0, maps[index].inverse_depth.cpu().numpy(), largest_jump=0.01)
-    return torch.where(torch.tensor(pieces, device=votes.device) >= config.min_piece_px, votes, 0.0)
+    current: Map, votes: Float[Tensor, "height width"], sources: list[Window], config: StereoConfig
+) -> Measured:
+    """What views agree on, where it is sharp, beside no jump, and in a connected piece of surface.
+
+    A few pixels alone agree by chance.
+    """
+    if not sources:
+        nothing = torch.zeros_like(votes)
+        return Measured(map=current, votes=nothing, sharpness=nothing, from_edge_px=nothing)
+    maps = [epipolar_map(source.camera, current.window.camera) for source in sources]
+    step = _step_of_one_pixel(current.window, maps, current.inverse_depth)
+    sharpness = _sharpness(current, step, sources, config)
+    largest_step = _LARGEST_STEP_PX * step
+    from_edge_px = distance_from_edges_px(current.inverse_depth, current.window.subject, largest_step)
+    votes = torch.where((sharpness > 0) & (from_edge_px > 0), votes, 0.0)
+    pieces = piece_sizes(votes.cpu().numpy() > 0, current.inverse_depth.cpu().numpy(), largest_jump=0.01)
+    large = torch.tensor(pieces, device=votes.device) >= config.min_piece_px
+    return Measured(
+        map=current,
+        votes=torch.where(large, votes, 0.0),
+        sharpness=sharpness,
+        from_edge_px=from_edge_px,
+    )
 
 
 def _agreement(

@@ -12,7 +12,7 @@ from ..maths.geometry import Pinhole, pinhole_in_object
 from ..scene import Region, View
 from .stereo import DepthMap, StereoResult
 
-SURE = 0.4
+SURE = 0.3
 """Confidence of a depth that carves: two photographs that agree to 0.8, or three to 0.53."""
 
 

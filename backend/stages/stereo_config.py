@@ -19,6 +19,8 @@ class StereoConfig:
     """Half width of the patches, in pixels of the size at hand."""
     min_correlation: float = 0.3
     """Patches that agree less than this are not measurements."""
+    full_sharpness: float = 0.03
+    """Patches whose agreement drops by less than this one pixel off say less about depth."""
     max_reprojection_px: float = 1.0
     """How far a point may move when carried to another photograph's depth map and back."""
     trust_of_half_size: float = 0.4
@@ -31,7 +33,7 @@ class StereoConfig:
     """How far at a time, in pixels of the size at hand."""
     growth_correlation: float = 0.5
     """Patches must agree this well to be grown from: what is hardly measured is not passed on."""
-    min_piece_px: int = 100
-    """Pixels of a connected piece of measured surface, at least; two patches side by side."""
+    min_piece_px: int = 300
+    """Pixels of a connected piece of measured surface, at least; six patches side by side."""
     noise: float = 1.2 / 255
     """Standard deviation of sensor and coding noise in a flat patch of a well exposed photograph."""

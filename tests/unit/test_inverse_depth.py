@@ -8,6 +8,7 @@ from torch import Tensor
 
 from backend.maths.geometry import Pinhole, pixel_centres, ray_directions
 from backend.maths.inverse_depth import (
+    distance_from_edges_px,
     fit_planes,
     lowest_with_neighbours,
     normals_from_planes,
@@ -171,3 +172,41 @@ def test_corners_that_touch_are_not_connected() -> None:
     checkers = np.indices((4, 4)).sum(axis=0) % 2 == 0
     sizes = piece_sizes(checkers, np.ones((4, 4), np.float32), largest_jump=0.01)
     assert (sizes == 1).all()
+
+
+# edges
+
+
+def test_a_map_without_edges_is_far_from_them() -> None:
+    smooth = plane_map()
+    far = distance_from_edges_px(smooth, torch.ones(16, 20, dtype=torch.bool), torch.full_like(smooth, 0.01))
+    assert (far >= 36).all()
+
+
+def test_a_jump_is_an_edge_and_a_slope_is_none() -> None:
+    """Both sides of the jump are beside it; columns count from there."""
+    jumping = plane_map()
+    jumping[:, 8:] += 0.02
+    all_of_it = torch.ones(16, 20, dtype=torch.bool)
+    for largest, edges in ((0.01, (7, 8)), (0.03, ())):
+        apart = distance_from_edges_px(jumping, all_of_it, torch.full_like(jumping, largest))
+        expected = [min((abs(column - edge) for edge in edges), default=36) for column in range(20)]
+        np.testing.assert_allclose(apart, np.tile(expected, (16, 1)))
+
+
+def test_the_smaller_of_two_steps_decides() -> None:
+    jumping = plane_map()
+    jumping[:, 8:] += 0.02
+    largest = torch.full_like(jumping, 0.03)
+    largest[:, 8:] = 0.01
+    apart = distance_from_edges_px(jumping, torch.ones(16, 20, dtype=torch.bool), largest)
+    assert (apart[:, 7:9] == 0).all()
+
+
+def test_what_is_off_the_subject_is_an_edge() -> None:
+    subject = torch.ones(16, 20, dtype=torch.bool)
+    subject[4, 5] = False
+    smooth = plane_map()
+    apart = distance_from_edges_px(smooth, subject, torch.full_like(smooth, 0.01))
+    rows, columns = np.indices((16, 20))
+    np.testing.assert_allclose(apart, np.hypot(rows - 4, columns - 5), rtol=1e-6)

@@ -6,10 +6,10 @@ from functools import cache
 import numpy as np
 import pytest
 import torch
-from scipy.ndimage import gaussian_filter
+from scipy.ndimage import distance_transform_edt, gaussian_filter
 
 from backend.errors import Cancelled, ErrorCode, ReconstructionError
-from backend.scene import View, no_progress, transform_points
+from backend.scene import Camera, Region, View, no_progress, transform_points
 from backend.stages.stereo import StereoResult, match_views
 from backend.stages.stereo_config import StereoConfig
 from tests.synthetic_scene import (
@@ -190,6 +190,48 @@ def test_confidence_tells_good_points_from_bad_ones() -> None:
 
 
 # what must not matter
+
+
+def test_points_beside_the_outline_are_trusted_less() -> None:
+    """There the surface turns away, and each photograph's outline is another place of it."""
+    points, confidence = world_points(matched()), matched().points.confidence
+    inside_px = np.empty(len(points))
+    for index, view in enumerate(scene().views):
+        mine = matched().points.view_index == index
+        assert view.mask is not None
+        inside = distance_transform_edt(view.mask > 0.5)
+        in_camera = transform_points(view.camera.camera_from_world, points[mine])
+        at = np.floor((in_camera @ view.camera.intrinsics.T)[:, :2] / in_camera[:, 2:]).astype(int)
+        inside_px[mine] = inside[at[:, 1], at[:, 0]]
+    beside, within = inside_px < 4, inside_px > 20
+    assert np.median(errors_percent(matched())[beside]) > 2 * np.median(errors_percent(matched())[within])
+    assert confidence[beside].mean() < 0.5 * confidence[within].mean()
+
+
+def test_stripes_along_the_epipolar_lines_tell_nothing() -> None:
+    """Their patches agree as well as those of any other stripes, but they do so at every depth."""
+    assert striped_wall_confidence(axis=0).mean() > 0.3
+    with pytest.raises(ReconstructionError, match="agree on only"):
+        striped_wall_confidence(axis=1)
+
+
+def striped_wall_confidence(axis: int) -> np.ndarray:
+    """Of the points of a wall whose greys change along one axis; the cameras stand side by side along x."""
+    views = []
+    for x in (-0.6, 0.0, 0.6):
+        camera_from_world = np.eye(4)
+        camera_from_world[:3, 3] = -x, 0.0, 4.0
+        lens = {"fx_px": 200.0, "fy_px": 200.0, "cx_px": 60.0, "cy_px": 45.0}
+        camera = Camera(camera_from_world=camera_from_world, **lens, width=120, height=90)
+        rows, columns = np.indices((90, 120)) + 0.5
+        on_wall = (x + 4 * (columns - 60) / 200, 4 * (rows - 45) / 200)[axis]
+        waves = np.sin(np.multiply.outer([13, 23, 37], on_wall))
+        grey = (0.5 + 0.1 * waves.sum(axis=0)).astype(np.float32)
+        image = np.repeat(grey[..., None], 3, axis=2)
+        views.append(View(name=f"{x}.png", camera=camera, image_srgb=image, mask=None))
+    unit = Region(object_from_world=np.eye(4))
+    cpu = torch.device("cpu")
+    return match_views(tuple(views), unit, StereoConfig(), device=cpu, progress=no_progress).points.confidence
 
 
 def test_the_exposure_of_one_photograph_does_not_matter() -> None:
