@@ -27,6 +27,10 @@ Vertices = Float64[np.ndarray, "vertices 3"]
 Faces = Int64[np.ndarray, "faces 3"]
 KeptVertices = Float64[np.ndarray, "kept_vertices 3"]
 KeptFaces = Int64[np.ndarray, "kept_faces 3"]
+_Backing = tuple[
+    Float64[np.ndarray, "vertices 3"], Bool[np.ndarray, "vertices views"], Float32[np.ndarray, "vertices"]
+]
+"""Normals, which views see a vertex, and its support."""
 
 
 MEASURED_EDGES = 0.03
@@ -67,16 +71,18 @@ def extract_mesh(
     vertices, faces = only_used(vertices, faces)
     progress(0.2, "simplifying")
     vertices, faces = simplified(vertices, faces, config.max_faces)
-    if 4 * len(faces) <= config.max_faces:
-        # room for more vertices is room for colour: photographs are finer than the grid
-        vertices, faces = trimesh.remesh.subdivide(vertices, faces)  # type: ignore[no-untyped-call]
-    progress(0.4, "support and colour")
+    progress(0.4, "support")
     points = transform_points(region.world_from_object, stereo.points.positions.astype(np.float64))
     cell = spacing(surface.distance.shape[0]) / np.cbrt(np.linalg.det(surface.grid_from_world[:3, :3]))
+    cameras = [view.camera for view in views]
+
+    def backing(vertices: Vertices, faces: Faces) -> _Backing:
+        normals = vertex_normals(vertices, faces)
+        seen = visible_from(vertices, normals, cameras, RayCaster(vertices, faces))
+        return normals, seen, support_of(vertices, seen, points, stereo.points.confidence, cell)
+
     decisions: tuple[Decision, ...] = ()
-    normals = vertex_normals(vertices, faces)
-    seen = visible_from(vertices, normals, [view.camera for view in views], RayCaster(vertices, faces))
-    support = support_of(vertices, seen, points, stereo.points.confidence, cell)
+    normals, seen, support = backing(vertices, faces)
     kept = in_seen_pieces(faces, seen)
     if len(points) and all(view.mask is None for view in views):
         measured_scene, decision = _open_or_closed(vertices, faces, support, stereo.depth_maps, cell)
@@ -85,6 +91,10 @@ def extract_mesh(
     used = np.unique(faces[kept])
     vertices, faces = only_used(vertices, faces[kept])
     normals, seen, support = normals[used], seen[used], support[used]
+    if 4 * len(faces) <= config.max_faces:
+        # room for more vertices is room for colour: photographs are finer than the grid
+        vertices, faces = trimesh.remesh.subdivide(vertices, faces)  # type: ignore[no-untyped-call]
+        normals, seen, support = backing(vertices, faces)
     progress(0.7, "colour")
     colours, exposure = colour_vertices(vertices, normals, seen, views)
     decisions = (*decisions, exposure)

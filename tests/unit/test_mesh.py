@@ -401,6 +401,19 @@ def test_a_piece_of_a_larger_scene_loses_its_back() -> None:
     assert lengths == {mesh.faces.max() + 1}
 
 
+def test_room_that_the_cut_leaves_is_room_for_color() -> None:
+    """The level set is too large to be subdivided; what is left of it is not."""
+    stereo = measured(floor_points(), edge_confidence=0.6)
+    scene, size = body_scene().without_masks(), len(level_set(floor_surface())[1])
+    plain, fine = (
+        extract(scene, floor_surface(), stereo, MeshConfig(max_faces=times * size)) for times in (1, 3)
+    )
+    assert len(plain.faces) < 0.75 * size
+    assert len(fine.faces) == 4 * len(plain.faces)
+    lengths = {len(fine.vertices), len(fine.normals), len(fine.colours_srgb), len(fine.support)}
+    assert lengths == {fine.faces.max() + 1}
+
+
 @pytest.mark.parametrize(("edge_confidence", "choice"), [(0.2, "closed smoothly"), (0.5, "cut off")])
 def test_only_sure_measurements_at_the_edges_open_a_scene(edge_confidence: float, choice: str) -> None:
     stereo = measured(floor_points(), edge_confidence=edge_confidence)
