@@ -1,8 +1,8 @@
 """A surface from points alone: noisy, sparse, incomplete, with or without normals.
 
-`linear` lets a short Neural-Pull run say which side is inside, opens the lids on which no points lie, and
-then fits the smoothest grid that agrees with the points' planes, as smooth as foretells best points that
-were held out. The other methods are networks alone.
+`linear` lets a short Neural-Pull run say which side is inside, and then fits the smoothest grid that agrees
+with the points' planes, as smooth as foretells best points that were held out. The other methods are
+networks alone.
 """
 
 from dataclasses import dataclass, field
@@ -16,8 +16,7 @@ from torch import Tensor
 from ..errors import ErrorCode, ReconstructionError
 from ..maths.evidence import merged_points, point_distances
 from ..maths.grid import locate, refined, spacing, value_and_gradient
-from ..maths.neighbours import against_neighbours, neighbour_planes, trusts
-from ..maths.sides import sides_by_walking
+from ..maths.neighbours import against_neighbours, crowding, neighbour_planes
 from ..maths.smooth_fit import fit_smooth
 from ..scene import Decision, Progress, SurfaceMesh, to_unit_sphere, transform_points, within
 from .mesh import (
@@ -59,9 +58,7 @@ class PointFitConfig:
     most_points: int = 200_000
     """Of more, so many are drawn."""
     sides: NetworkConfig = field(
-        default_factory=lambda: NetworkConfig(
-            layers=3, steps=300, batch=500, learning_rate=5e-3, warm_up=30, anywhere=0.25
-        )
+        default_factory=lambda: NetworkConfig(layers=3, steps=300, batch=500, learning_rate=5e-3, warm_up=30)
     )
     """`linear`: of the run that finds the sides. With slower learning a torus is still without its hole."""
     network: NetworkConfig = field(default_factory=NetworkConfig)
@@ -114,7 +111,7 @@ def fit_points(
         drawn = torch.randperm(len(positions), generator=generator)[: config.most_points].numpy()
         decisions.append(_decision("points", f"{config.most_points} of {len(positions)}", "drawn by lot"))
         positions, normals = positions[drawn], None if normals is None else normals[drawn]
-    trust = trusts(positions)
+    trust = crowding(positions)
     low, high = _extent(positions[trust > _SURE])
     frame = to_unit_sphere((low + high) / 2, _MARGIN * float((high - low).max()) / 2)
     placed = transform_points(frame, positions)
@@ -214,8 +211,6 @@ def _fit_linear(
         progress=within(progress, 0.0, 0.6),
     )
     with torch.no_grad():
-        progress(0.6, "walking from side to side")
-        sides = sides_by_walking(sides, sure)
         progress(0.6, "choosing the smoothness")
         held = torch.randperm(len(points.positions), generator=generator) % _LEFT_OUT == 0
         foretold = []
@@ -223,7 +218,10 @@ def _fit_linear(
             progress(0.6, "choosing the smoothness")
             coarse = _fit_levels(points.where(~held), sides, _COARSE, tried, config.prior)
             foretold.append(_distance_off(points.where(held), coarse))
-        missed, smoothness = min(zip(foretold, config.smoothness, strict=True))
+        # The smoothest within one standard error of the best (Breiman et al., CART, 1984, section 3.4.3).
+        as_good = sum(min(foretold))
+        tries = zip(config.smoothness, foretold, strict=True)
+        smoothness, missed = max((tried, off) for tried, (off, _) in tries if off <= as_good)
         progress(0.8, f"fitting points on a grid of {config.nodes}^3")
         levels = (*(nodes for nodes in (*_COARSE, 96) if nodes < config.nodes), config.nodes)
         distance = _fit_levels(points, sides, levels, smoothness, config.prior)
@@ -290,11 +288,16 @@ def _facing(
     return F.normalize(share * sign * points.planes + (1 - share) * gradient, dim=-1), weight
 
 
-def _distance_off(points: _Points, distance: Float[Tensor, "nodes nodes nodes"]) -> float:
-    """Mean distance of the points from the zero level, weighted by trust; to first order |f| / |grad f|."""
+def _distance_off(points: _Points, distance: Float[Tensor, "nodes nodes nodes"]) -> tuple[float, float]:
+    """Mean distance of the points from the zero level, and its standard error.
+
+    To first order: |f| / |grad f|, weighted by trust.
+    """
     value, gradient = value_and_gradient(distance, locate(points.positions, len(distance)))
     off = value.abs() / torch.linalg.vector_norm(gradient, dim=-1).clamp(min=0.3)
-    return float((points.trust * off).sum() / points.trust.sum())
+    share = points.trust / points.trust.sum()
+    mean = (share * off).sum()
+    return float(mean), float((share * (off - mean)).square().sum().sqrt())
 
 
 def _decision(what: str, choice: str, because: str) -> Decision:
