@@ -40,6 +40,12 @@ def backend_python_or_reason(context: bpy.types.Context) -> tuple[Path | None, s
     return found.path, ""
 
 
+def reason_against_a_job(context: bpy.types.Context) -> str:
+    """Why none can be started now; empty where one can."""
+    job = jobs.running()
+    return f"{job.title} is still running" if job else backend_python_or_reason(context)[1]
+
+
 def backend_state(context: bpy.types.Context) -> tuple[State, str]:
     """What is known of the backend, for the panel: a state and a line."""
     try:

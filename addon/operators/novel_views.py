@@ -20,7 +20,7 @@ from ..properties import settings_of
 from ..result_mesh import result_or_none
 from ..solved import SolvedCamera, write_cameras
 from ..view_rendering import IMAGES, TRANSFORMS
-from .environment import backend_python_or_reason
+from .environment import backend_python_or_reason, reason_against_a_job
 from .on_result import OnResult, Status, has_result, refused, result_of
 
 
@@ -48,8 +48,7 @@ class FEWVIEW_OT_render_novel_views(OnResult, bpy.types.Operator):
         """Not twice at once, not without a backend, and not without a job and cameras."""
         if not has_result(cls, context):
             return False
-        job = jobs.running()
-        reason = f"{job.title} is still running" if job else backend_python_or_reason(context)[1]
+        reason = reason_against_a_job(context)
         if not reason and not can_be_rendered(_folder_of(result_or_none(context))):
             reason = "The files of the job are gone: reconstruct again"
         if not reason and not any(made.type == "CAMERA" for made in context.scene.objects):

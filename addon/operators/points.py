@@ -14,7 +14,7 @@ from ..ply import write_points
 from ..properties import settings_of
 from ..result_import import import_fit_steps
 from ..scenes import scene_name_of
-from .environment import backend_python_or_reason
+from .environment import backend_python_or_reason, reason_against_a_job
 from .reconstruct import jobs_parent
 
 
@@ -34,8 +34,7 @@ class FEWVIEW_OT_fit_points(bpy.types.Operator):
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
         """Not twice at once, not without a backend, and not without points."""
-        job = jobs.running()
-        reason = f"{job.title} is still running" if job else backend_python_or_reason(context)[1]
+        reason = reason_against_a_job(context)
         if not reason and context.mode != "OBJECT":
             reason = "Change to Object Mode first"
         reason = reason or reason_against(context.active_object)

@@ -21,7 +21,7 @@ from ..result_import import import_result_steps, show_estimated_cameras
 from ..scenes import scene_name_of, scene_named
 from ..solved import read_solved
 from ..state_lines import FEWEST_IMAGES
-from .environment import backend_python_or_reason
+from .environment import backend_python_or_reason, reason_against_a_job
 from .images import used_images
 
 _LOG_TEXT = "fewview_log"
@@ -101,8 +101,7 @@ class FEWVIEW_OT_reconstruct(bpy.types.Operator):
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
         """Not twice at once, and not without a backend."""
-        job = jobs.running()
-        reason = f"{job.title} is still running" if job else backend_python_or_reason(context)[1]
+        reason = reason_against_a_job(context)
         if reason:
             cls.poll_message_set(reason)
         return not reason

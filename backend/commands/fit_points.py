@@ -9,9 +9,8 @@ from typing import TYPE_CHECKING
 
 from ..errors import ErrorCode, ReconstructionError
 from ..wire import protocol
-from ..wire.speaker import Speaker
-from .cancelling import CancelRequest, catch_signals
-from .reconstruct import converse, say_last, with_terminal
+from .cancelling import catch_signals
+from .reconstruct import converse_or_show
 
 if TYPE_CHECKING:
     from ..maths.metrics import ErrorAgainstTruth, TrueSurface
@@ -46,29 +45,11 @@ def add_fit_points(parser: argparse.ArgumentParser) -> None:
 
 def fit_points_command(parsed: argparse.Namespace) -> int:
     """Fit and leave mesh.ply and report.json; the exit code."""
-    return _on_wire(parsed) if parsed.wire else _on_terminal(parsed)
-
-
-def _on_terminal(parsed: argparse.Namespace) -> int:
-    return with_terminal(
-        lambda listener: listener.finished(parsed.output, _fit(parsed, listener)),
-        cancelled=lambda listener: listener.warned(_cancelled().text),
-    )
-
-
-def _on_wire(parsed: argparse.Namespace) -> int:
-    from .wire_listener import WireListener
-
-    def work(request: CancelRequest, speaking: Speaker) -> None:
-        outcome = _fit(parsed, WireListener(request, speaking))
-        say_last(speaking, protocol.Finished(output=str(parsed.output), files=outcome.files))
-
-    return converse(work, _cancelled())
-
-
-def _cancelled() -> protocol.Failed:
-    return protocol.Failed(
+    cancelled = protocol.Failed(
         code=protocol.CANCELLED, text="The fit was stopped; nothing was written.", remedy="Start it again."
+    )
+    return converse_or_show(
+        lambda listener: _fit(parsed, listener), parsed.output, wire=parsed.wire, cancelled=cancelled
     )
 
 

@@ -73,6 +73,21 @@ def converse(work: Callable[[CancelRequest, Speaker], None], cancelled: protocol
         )
 
 
+def converse_or_show(
+    work: Callable[["Listener"], "Outcome"], output: Path, *, wire: bool, cancelled: protocol.Failed
+) -> int:
+    """Do the work for a program on the wire, or before a person's eyes; the exit code.
+
+    `cancelled` is the last word where it was asked to stop.
+    """
+    if wire:
+        return converse(lambda request, speaking: _work_and_say(work, output, request, speaking), cancelled)
+    return with_terminal(
+        lambda listener: listener.finished(output, work(listener)),
+        cancelled=lambda listener: listener.warned(cancelled.text),
+    )
+
+
 def settle(
     work: Callable[[], None],
     *,
@@ -180,11 +195,16 @@ def say_last(speaking: Speaker, message: protocol.Message) -> None:
 
 
 def _run_job_file(job_path: Path, request: CancelRequest, speaking: Speaker) -> None:
+    job, base = _read_job(job_path), job_path.absolute().parent
+    _work_and_say(lambda listener: run_job(job, base, listener), base / job.output, request, speaking)
+
+
+def _work_and_say(
+    work: Callable[["Listener"], "Outcome"], output: Path, request: CancelRequest, speaking: Speaker
+) -> None:
     from .wire_listener import WireListener
 
-    job = _read_job(job_path)
-    outcome = run_job(job, job_path.absolute().parent, WireListener(request, speaking))
-    output = job_path.absolute().parent / job.output
+    outcome = work(WireListener(request, speaking))
     say_last(speaking, protocol.Finished(output=str(output), files=outcome.files))
 
 

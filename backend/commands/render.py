@@ -6,9 +6,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ..wire import protocol
-from ..wire.speaker import Speaker
-from .cancelling import CancelRequest, catch_signals
-from .reconstruct import converse, say_last, with_terminal
+from .cancelling import catch_signals
+from .reconstruct import converse_or_show
 
 if TYPE_CHECKING:
     from ..pipeline import Listener, Outcome
@@ -32,31 +31,13 @@ def add_render(parser: argparse.ArgumentParser) -> None:
 
 def render(parsed: argparse.Namespace) -> int:
     """Render and say which pictures there are; the exit code."""
-    return _on_wire(parsed) if parsed.wire else _on_terminal(parsed)
-
-
-def _on_terminal(parsed: argparse.Namespace) -> int:
-    return with_terminal(
-        lambda listener: listener.finished(parsed.output, _render(parsed, listener)),
-        cancelled=lambda listener: listener.warned(_cancelled().text),
-    )
-
-
-def _on_wire(parsed: argparse.Namespace) -> int:
-    from .wire_listener import WireListener
-
-    def work(request: CancelRequest, speaking: Speaker) -> None:
-        outcome = _render(parsed, WireListener(request, speaking))
-        say_last(speaking, protocol.Finished(output=str(parsed.output), files=outcome.files))
-
-    return converse(work, _cancelled())
-
-
-def _cancelled() -> protocol.Failed:
-    return protocol.Failed(
+    cancelled = protocol.Failed(
         code=protocol.CANCELLED,
         text="The rendering was stopped; no picture was written.",
         remedy="Start it again.",
+    )
+    return converse_or_show(
+        lambda listener: _render(parsed, listener), parsed.output, wire=parsed.wire, cancelled=cancelled
     )
 
 

@@ -13,7 +13,10 @@ from ..scene import Region, View
 from .stereo import DepthMap, StereoResult
 
 SURE = 0.3
-"""Confidence of a depth that carves: two photographs that agree to 0.8, or three to 0.53."""
+"""Confidence of a depth that carves, or that opens a scene at the pictures' edges.
+
+Off edges that is two photographs that agree to 0.6, or three to 0.4.
+"""
 
 
 @dataclass(frozen=True, kw_only=True)

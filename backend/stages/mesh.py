@@ -19,6 +19,7 @@ from ..maths.grid import near_surface, refined, spacing
 from ..maths.pieces import connected_pieces
 from ..maths.raycast import RayCaster, visible_from
 from ..scene import Decision, Progress, Region, SurfaceMesh, View, transform_points
+from .measurements import SURE
 from .stereo import DepthMap, StereoResult
 from .train import Surface
 from .vertex_colours import colour_vertices
@@ -290,8 +291,8 @@ def _open_or_closed(
 
 
 def measured_at_edges(map_: DepthMap) -> float:
-    """Share of a frame just inside the picture where the surface was measured with some confidence."""
-    sure = map_.confidence > 0.3
+    """Share of a frame just inside the picture where the surface was surely measured."""
+    sure = map_.confidence > SURE
     inset = max(4, round(0.02 * min(sure.shape)))
     frame = [sure[inset], sure[-inset - 1], sure[:, inset], sure[:, -inset - 1]]
     return float(np.concatenate(frame).mean())

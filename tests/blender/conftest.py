@@ -4,7 +4,7 @@ import importlib
 import os
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import ModuleType
 
@@ -62,3 +62,18 @@ def scene(extension: str) -> object:
 def addon(scene: object, extension: str) -> ModuleType:
     """The installed add-on's package `addon`, in an empty scene."""
     return importlib.import_module(f"{extension}.addon")
+
+
+@pytest.fixture
+def part(addon: ModuleType) -> Iterator[Callable[[str], ModuleType]]:
+    """The installed add-on's modules by name; no job runs before the test or after it."""
+
+    def module(name: str) -> ModuleType:
+        return importlib.import_module(f"{addon.__name__}.{name}")
+
+    jobs = module("jobs")
+    jobs.stop()
+    jobs.forget()
+    yield module
+    jobs.stop()
+    jobs.forget()

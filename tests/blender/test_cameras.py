@@ -1,10 +1,8 @@
 """Solved cameras in the scene: where they stand, what they show, and what stays the user's."""
 
-import importlib
 import json
 import sys
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -17,12 +15,6 @@ from mathutils import Matrix, Vector  # noqa: E402
 
 pytestmark = pytest.mark.blender
 LENS = {"w": 320, "h": 240, "fl_x": 400.0, "fl_y": 400.0, "cx": 170.0, "cy": 110.0}
-
-
-@pytest.fixture
-def part(addon: ModuleType) -> Any:
-    """A module of the add-on by its name."""
-    return lambda name: importlib.import_module(f"{addon.__name__}.{name}")
 
 
 def pose(rng: np.random.Generator) -> Any:

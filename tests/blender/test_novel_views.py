@@ -1,11 +1,10 @@
 """A finished job rendered from Blender's cameras: what they see in the scene is what the pictures show."""
 
-import importlib
 import json
 import os
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -28,22 +27,12 @@ COLOURS = np.array([(200, 60, 60), (60, 200, 60), (60, 60, 200), (200, 200, 60)]
 MOVE = Matrix.LocRotScale(Vector((4, -2, 1)), Euler((0.5, -0.3, 2.0)), Vector((2.5, 2.5, 2.5)))
 
 
-@pytest.fixture
-def part(addon: ModuleType, monkeypatch: pytest.MonkeyPatch) -> Iterator[Part]:
-    """The installed add-on's modules by name; this Python is taken for the backend's unless one is named."""
-
-    def module(name: str) -> ModuleType:
-        return importlib.import_module(f"{addon.__name__}.{name}")
-
+@pytest.fixture(autouse=True)
+def some_python(part: Part, monkeypatch: pytest.MonkeyPatch) -> None:
+    """This one is taken for the backend's unless one is named."""
     if "FEWVIEW_PYTHON" not in os.environ:
         monkeypatch.setenv("FEWVIEW_PYTHON", sys.executable)
-    monkeypatch.setattr(module("environment"), "_known", {})
-    jobs = module("jobs")
-    jobs.stop()
-    jobs.forget()
-    yield module
-    jobs.stop()
-    jobs.forget()
+    monkeypatch.setattr(part("environment"), "_known", {})
 
 
 @pytest.fixture

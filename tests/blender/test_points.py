@@ -1,10 +1,9 @@
 """Points alone: what is written of an object, and the surface that comes back, beside it in the world."""
 
-import importlib
 import os
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -21,21 +20,6 @@ Part = Callable[[str], ModuleType]
 MATRIX = np.array([[0, -2, 0, 5], [1, 0, 0, -3], [0, 0, 3, 1], [0, 0, 0, 1]], np.float64)
 """Of an object: turned, of unequal scale, moved."""
 MIRROR = np.diag([-1.0, 2.0, 1.0, 1.0])
-
-
-@pytest.fixture
-def part(addon: ModuleType) -> Iterator[Part]:
-    """The installed add-on's modules by name."""
-
-    def module(name: str) -> ModuleType:
-        return importlib.import_module(f"{addon.__name__}.{name}")
-
-    jobs = module("jobs")
-    jobs.stop()
-    jobs.forget()
-    yield module
-    jobs.stop()
-    jobs.forget()
 
 
 @pytest.fixture
