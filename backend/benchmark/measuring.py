@@ -1,7 +1,9 @@
 """One run, in a process of its own, because a process knows only one peak of its memory; and its numbers."""
 
+import dataclasses
 import json
 import os
+import shutil
 import time
 from collections import deque
 from collections.abc import Mapping
@@ -15,12 +17,15 @@ from ..commands.child import run_child
 from ..errors import ReconstructionError
 from ..machine import choose_device
 from ..mesh_files import read_mesh
+from ..pipeline import code_fingerprint
+from ..presets import PRESETS
 from ..records import load_record
 from ..results import RADIANCE
 from ..stages.radiance_field import Radiance
 from ..wire.client import ROOT, clean_environment
+from ..workspace import fingerprint
 from .held_out import held_out_fit, held_out_radiance_fit, held_out_views
-from .suites import Case, image_paths
+from .suites import Case, Found, image_paths, with_budget
 
 _WITH_KNOWN_CAMERAS = ("region", "stereo", "train", "mesh")
 """The stages after the cameras."""
@@ -50,6 +55,11 @@ class Trial:
     budget_s: float | None = None
     """For the field stage; None for what the preset needs."""
 
+    @property
+    def name(self) -> str:
+        """Of its folder."""
+        return f"{self.case.name}-{with_budget(self.preset, self.budget_s)}-{self.seed}"
+
 
 @dataclass(frozen=True, kw_only=True)
 class Measurement:
@@ -64,13 +74,55 @@ class Measurement:
     budget_s: float | None = None
     failure: str | None = None
     """What the run, or the comparison with held-out views, said last."""
+    inputs: str = ""
+    """Fingerprint of all that the numbers depend on."""
 
 
-def measure(trial: Trial, output: Path, *, program: tuple[str, ...], request: CancelRequest) -> Measurement:
-    """Run the trial from nothing into `output`, a folder that is not there yet.
+def inputs_of(trial: Trial, machine: Mapping[str, object]) -> str:
+    """Changes with the code, the preset's settings, the case's files and the machine."""
+    case, folder = trial.case, trial.folder
+    given = [
+        folder / name for name in (case.images, case.cameras, case.masks, case.truth) if name is not None
+    ]
+    settings = dataclasses.replace(trial, folder=Path(case.folder)), PRESETS[trial.preset]
+    return fingerprint(code_fingerprint(), settings, sorted(machine.items()), *given)
 
-    `program` is the command that starts the backend. Raises Cancelled.
+
+def measured_before(
+    output: Path, found: Found, device: str, machine: Mapping[str, object]
+) -> dict[Trial, Measurement]:
+    """What a benchmark left in the folder, as far as nothing that it depends on has changed since."""
+    try:
+        written = json.loads((output / "results.json").read_text(encoding="utf-8"))["runs"]
+        runs = [Measurement(**run) for run in written]
+    except (OSError, ValueError, KeyError, TypeError):
+        return {}
+    places = {case.name: (case, folder) for case, folder in found.cases}
+    kept = {}
+    for run in runs:
+        if run.case in places and run.preset in PRESETS and run.failure is None:
+            case, folder = places[run.case]
+            trial = Trial(
+                case=case,
+                folder=folder,
+                preset=run.preset,
+                seed=run.seed,
+                device=device,
+                budget_s=run.budget_s,
+            )
+            if inputs_of(trial, machine) == run.inputs:
+                kept[trial] = run
+    return kept
+
+
+def measure(
+    trial: Trial, output: Path, *, inputs: str, program: tuple[str, ...], request: CancelRequest
+) -> Measurement:
+    """Run the trial from nothing into `output`; what a trial before left there is removed.
+
+    `inputs` is the trial's fingerprint, `program` the command that starts the backend. Raises Cancelled.
     """
+    shutil.rmtree(output, ignore_errors=True)
     last_lines: deque[str] = deque(maxlen=2)
     started = time.perf_counter()
     exit_code = run_child(
@@ -87,6 +139,7 @@ def measure(trial: Trial, output: Path, *, program: tuple[str, ...], request: Ca
         preset=trial.preset,
         budget_s=trial.budget_s,
         seed=trial.seed,
+        inputs=inputs,
     )
     if exit_code:
         words = " ".join(last_lines) or f"ended with exit code {exit_code}"

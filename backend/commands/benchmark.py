@@ -23,7 +23,13 @@ def add_benchmark(parser: argparse.ArgumentParser) -> None:
     """The command's words."""
     add = parser.add_argument
     add("suite", choices=tuple(SUITES), help="what to measure")
-    add("--output", metavar="DIR", type=Path, required=True, help="new or empty folder")
+    add(
+        "--output",
+        metavar="DIR",
+        type=Path,
+        required=True,
+        help="new, empty, or of a benchmark to go on with",
+    )
     add("--scenes", metavar="DIR", type=Path, help="the suite's scenes, as make renders them")
     add("--photos", metavar="DIR", type=Path, help="the sets of real photographs")
     add("--presets", nargs="+", choices=PRESETS, default=["fast", "balanced"])
@@ -42,6 +48,7 @@ def add_benchmark(parser: argparse.ArgumentParser) -> None:
 def benchmark(parsed: argparse.Namespace, *, program: Sequence[str] | None = None) -> int:
     """Measure the suite and leave results.json, table.md and plot.svg; the exit code.
 
+    What was measured before in the same folder is kept where nothing that it depends on has changed.
     `program` is the command that starts the backend: by default this one.
     """
     request = CancelRequest()
@@ -56,32 +63,44 @@ def benchmark(parsed: argparse.Namespace, *, program: Sequence[str] | None = Non
 
 def _measure_all(parsed: argparse.Namespace, program: tuple[str, ...], request: CancelRequest) -> None:
     # Here, so that the other commands start without torch; and before hours of work, if one is missing.
-    from ..benchmark.measuring import Trial, measure
+    from ..benchmark.measuring import Trial, inputs_of, measure, measured_before
     from ..benchmark.writing import machine_facts, write_results
 
     found = find_cases(SUITES[parsed.suite], parsed.scenes, parsed.photos)
     _check(parsed, found)
+    machine = machine_facts()
     about = {
         "suite": parsed.suite,
         "presets": parsed.presets,
         "budgets_s": parsed.budgets,
         "seeds": list(range(parsed.seeds)),
         "device": parsed.device,
-        "machine": machine_facts(),
+        "machine": machine,
         "missing": found.missing,
     }
     if found.missing:
         _say(f"Left out, because their files are not there: {', '.join(found.missing)}")
-    runs: list[Measurement] = []
-    for case, folder in found.cases:
-        for preset, budget_s, seed in product(parsed.presets, [None, *parsed.budgets], range(parsed.seeds)):
-            trial = Trial(
-                case=case, folder=folder, preset=preset, seed=seed, device=parsed.device, budget_s=budget_s
+    trials = [
+        Trial(case=case, folder=folder, preset=preset, seed=seed, device=parsed.device, budget_s=budget_s)
+        for case, folder in found.cases
+        for preset, budget_s, seed in product(parsed.presets, [None, *parsed.budgets], range(parsed.seeds))
+    ]
+    runs = measured_before(parsed.output, found, parsed.device, machine)
+    if runs:
+        _say(f"Kept from before, as nothing that it depends on has changed: {len(runs)}.")
+    for trial in trials:
+        if trial not in runs:
+            runs[trial] = measure(
+                trial,
+                parsed.output / "runs" / trial.name,
+                inputs=inputs_of(trial, machine),
+                program=program,
+                request=request,
             )
-            output = parsed.output / "runs" / f"{case.name}-{with_budget(preset, budget_s)}-{seed}"
-            runs.append(measure(trial, output, program=program, request=request))
-            _say(_line(runs[-1]))
-            write_results(parsed.output, about, runs)
+            _say(_line(runs[trial]))
+        write_results(
+            parsed.output, about, [runs[known] for known in dict.fromkeys((*trials, *runs)) if known in runs]
+        )
     sys.stdout.write(f"{parsed.output / 'table.md'}\n")
 
 
@@ -94,10 +113,11 @@ def _check(parsed: argparse.Namespace, found: Found) -> None:
             "Run `make benchmark`, which renders the scenes, or give --scenes and --photos.",
         )
     output: Path = parsed.output
-    if output.exists() and (not output.is_dir() or any(output.iterdir())):
+    begun = (output / "results.json").is_file() and (output / "runs").is_dir()
+    if output.exists() and not begun and (not output.is_dir() or any(output.iterdir())):
         raise ReconstructionError(
             ErrorCode.OUTPUT_UNUSABLE,
-            f"{output} is not an empty folder.",
+            f"{output} is neither an empty folder nor that of a benchmark.",
             "Choose a new folder for --output.",
         )
     output.mkdir(parents=True, exist_ok=True)

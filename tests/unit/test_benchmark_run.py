@@ -154,7 +154,27 @@ def test_a_folder_with_something_in_it_is_not_touched(
     (output / "mine.txt").write_text("mine")
     assert command.benchmark(parsed(photos, output), program=fake_program()) == EXIT_USER_ERROR
     assert [path.name for path in output.iterdir()] == ["mine.txt"]
-    assert "not an empty folder" in capsys.readouterr().err
+    assert "neither an empty folder" in capsys.readouterr().err
+
+
+def test_a_benchmark_goes_on_where_it_was(
+    photos: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """What is known is not measured again, whatever is asked for, until something it depends on changes."""
+    output = tmp_path / "out"
+    first = parsed(photos, output, "--seeds", "1", "--presets", "fast")
+    assert command.benchmark(first, program=fake_program()) == EXIT_FINE
+    (fast,) = json.loads((output / "results.json").read_text())["runs"]
+    second = parsed(photos, output, "--seeds", "1", "--presets", "balanced")
+    assert command.benchmark(second, program=fake_program()) == EXIT_FINE
+    runs = json.loads((output / "results.json").read_text())["runs"]
+    assert [run["preset"] for run in runs] == ["balanced", "fast"]
+    assert runs[1] == fast
+    assert "Kept from before" in capsys.readouterr().err
+    Image.new("RGBA", (32, 24)).save(photos / "toy" / "images" / "0.png")
+    assert command.benchmark(first, program=fake_program()) == EXIT_FINE
+    (again,) = json.loads((output / "results.json").read_text())["runs"]
+    assert again["inputs"] != fast["inputs"]
 
 
 def test_a_stop_ends_the_run_and_says_so(
