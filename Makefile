@@ -74,7 +74,6 @@ DATA ?= $(wildcard ../shared/data)
 # Renders what is missing or out of date, then measures from nothing.
 benchmark: .venv/.ready .venv-blender/.ready
 	$(BPY) -m benchmarks.render_scenes $(SUITE) --output $(BENCHMARK)/scenes $(if $(DATA),--data $(DATA))
-	rm -rf $(BENCHMARK)/$(SUITE)
 	$(BACKEND) -m backend benchmark $(SUITE) --output $(BENCHMARK)/$(SUITE) --seeds $(SEEDS) \
 	    $(if $(BUDGETS),--budgets $(BUDGETS)) --scenes $(BENCHMARK)/scenes $(if $(DATA),--photos $(DATA))
 
