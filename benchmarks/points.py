@@ -34,7 +34,8 @@ from backend.maths.neighbours import neighbour_planes
 from backend.scene import SurfaceMesh, no_progress
 from backend.stages.mesh import MeshConfig, vertex_normals
 from backend.stages.point_cloud import PointCloud, clean_cloud, read_cloud
-from backend.stages.point_fit import PointFitConfig, fit_points, mesh_of_points
+from backend.stages.point_fit import PointFitConfig, fit_points
+from backend.stages.point_mesh import mesh_of_points
 from backend.stages.point_network import NetworkConfig
 
 NAMES = ("anchor", "00011084", "00016513", "00994122")

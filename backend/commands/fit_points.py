@@ -84,7 +84,8 @@ def _fit_into(
     from ..pipeline import Outcome
     from ..stages.mesh import MeshConfig
     from ..stages.point_cloud import read_cloud
-    from ..stages.point_fit import PointFitConfig, fit_points, mesh_of_points
+    from ..stages.point_fit import PointFitConfig, fit_points
+    from ..stages.point_mesh import mesh_of_points
 
     device = choose_device(parsed.device)
     set_up_torch(device)

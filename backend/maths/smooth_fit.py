@@ -8,6 +8,7 @@ simplest discrete form): solved by conjugate gradients, to start from a coarser 
 from jaxtyping import Float
 from torch import Tensor
 
+from .conjugate_gradients import conjugate_gradients
 from .grid import laplacian
 
 
@@ -25,16 +26,4 @@ def fit_smooth(
     def apply(f: Tensor) -> Tensor:
         return weight * f + smoothness * laplacian(laplacian(f))
 
-    solution = start.clone()
-    residual = weight * target - apply(solution)
-    direction = residual / diagonal
-    energy = (residual * direction).sum()
-    for _ in range(steps):
-        image = apply(direction)
-        step = energy / (direction * image).sum().clamp(min=1e-30)
-        solution += step * direction
-        residual -= step * image
-        conditioned = residual / diagonal
-        before, energy = energy, (residual * conditioned).sum()
-        direction = conditioned + (energy / before.clamp(min=1e-30)) * direction
-    return solution
+    return conjugate_gradients(apply, diagonal, weight * target, start, steps=steps)

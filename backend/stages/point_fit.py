@@ -1,8 +1,8 @@
 """A surface from points alone: noisy, sparse, incomplete, with or without normals.
 
-`linear` lets a short Neural-Pull run say which side is inside, and then fits the smoothest grid that agrees
-with the points' planes, as smooth as foretells best points that were held out. The other methods are
-networks alone.
+`linear` lets a short Neural-Pull run say which side is inside, opens the lids on which no points lie, and
+then fits the smoothest grid that agrees with the points' planes, as smooth as foretells best points that
+were held out. The other methods are networks alone.
 """
 
 from dataclasses import dataclass, field
@@ -16,18 +16,10 @@ from torch import Tensor
 from ..errors import ErrorCode, ReconstructionError
 from ..maths.evidence import merged_points, point_distances
 from ..maths.grid import locate, refined, spacing, value_and_gradient
-from ..maths.neighbours import against_neighbours, crowding, neighbour_planes
+from ..maths.neighbours import against_neighbours, neighbour_planes, trusts
+from ..maths.sides import Sides, sides_by_walking
 from ..maths.smooth_fit import fit_smooth
-from ..scene import Decision, Progress, SurfaceMesh, to_unit_sphere, transform_points, within
-from .mesh import (
-    MeshConfig,
-    level_set,
-    measured_share,
-    only_used,
-    simplified,
-    vertex_normals,
-    without_small_pieces,
-)
+from ..scene import Decision, Progress, to_unit_sphere, transform_points, within
 from .point_cloud import PointCloud
 from .point_network import NetworkConfig, fit_network
 from .train import Surface
@@ -40,9 +32,14 @@ _MARGIN = 1.25
 """Half a side of the cube over half the widest extent of the cloud."""
 _MOST_FLIPPED = 0.1
 """Share of normals against their neighbours'; more, and the signs are chance."""
+_CLEAR = 3.0
+"""Where the nearest point tells how far the surface is: so many times as far as points are apart."""
+_WORK = 10_000
+"""Conjugate gradients on a grid, times its nodes along an axis: with fewer the network's waves stay."""
 _SURE = 0.25
 """Trust of points that bound the cube and tell the networks: three and a half times the usual area."""
-_GREY = 180
+_KNOWN = 0.5
+"""Trust of points that a walk may not pass unnoticed: strays would be walls."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,7 +55,9 @@ class PointFitConfig:
     most_points: int = 200_000
     """Of more, so many are drawn."""
     sides: NetworkConfig = field(
-        default_factory=lambda: NetworkConfig(layers=3, steps=300, batch=500, learning_rate=5e-3, warm_up=30)
+        default_factory=lambda: NetworkConfig(
+            layers=3, steps=300, batch=500, learning_rate=5e-3, warm_up=30, anywhere=0.25
+        )
     )
     """`linear`: of the run that finds the sides. With slower learning a torus is still without its hole."""
     network: NetworkConfig = field(default_factory=NetworkConfig)
@@ -66,7 +65,7 @@ class PointFitConfig:
     smoothness: tuple[float, ...] = (0.1, 0.5, 2.0)
     """`linear`: of the squared Laplacian at 64 nodes; the choice."""
     prior: float = 1e-2
-    """`linear`: weight of the field that found the sides, at 32 nodes."""
+    """`linear`: weight of the sides' distances far from points, at 32 nodes."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -111,7 +110,7 @@ def fit_points(
         drawn = torch.randperm(len(positions), generator=generator)[: config.most_points].numpy()
         decisions.append(_decision("points", f"{config.most_points} of {len(positions)}", "drawn by lot"))
         positions, normals = positions[drawn], None if normals is None else normals[drawn]
-    trust = crowding(positions)
+    trust = trusts(positions)
     low, high = _extent(positions[trust > _SURE])
     frame = to_unit_sphere((low + high) / 2, _MARGIN * float((high - low).max()) / 2)
     placed = transform_points(frame, positions)
@@ -133,29 +132,6 @@ def fit_points(
             "Check that they lie on a surface; try another --method.",
         )
     return Surface(distance=distance.cpu().numpy(), grid_from_world=frame, decisions=tuple(decisions))
-
-
-def mesh_of_points(
-    surface: Surface, cloud: PointCloud, config: MeshConfig, *, progress: Progress
-) -> SurfaceMesh:
-    """The zero level as a grey mesh in the world frame; `support` is how near points are."""
-    progress(0.0, "level set")
-    vertices, faces = level_set(surface)
-    faces = without_small_pieces(vertices, faces, config.smallest_piece)
-    vertices, faces = only_used(vertices, faces)
-    progress(0.4, "simplifying")
-    vertices, faces = simplified(vertices, faces, config.max_faces)
-    progress(0.8, "support")
-    cell = spacing(len(surface.distance)) / np.cbrt(np.linalg.det(surface.grid_from_world[:3, :3]))
-    sure = np.ones(len(cloud.positions), np.float32)
-    return SurfaceMesh(
-        vertices=vertices,
-        faces=faces,
-        normals=vertex_normals(vertices, faces).astype(np.float32),
-        colours_srgb=np.full((len(vertices), 3), _GREY, np.uint8),
-        support=measured_share(vertices, cloud.positions, sure, cell).astype(np.float32),
-        decisions=surface.decisions,
-    )
 
 
 def _known_normals(cloud: PointCloud) -> Float64[np.ndarray, "points 3"]:
@@ -202,7 +178,7 @@ def _fit_linear(
     points: _Points, config: PointFitConfig, *, generator: torch.Generator, progress: Progress
 ) -> tuple[Float[Tensor, "nodes nodes nodes"], list[Decision]]:
     sure = points.positions[points.trust > _SURE]
-    sides = fit_network(
+    learned = fit_network(
         sure,
         _COARSE[-1],
         "neural-pull",
@@ -211,6 +187,11 @@ def _fit_linear(
         progress=within(progress, 0.0, 0.6),
     )
     with torch.no_grad():
+        progress(0.6, "walking from side to side")
+        known = points.trust > _KNOWN
+        sides = sides_by_walking(
+            learned, points.positions[known], points.planes[known], points.flatness[known].square()
+        )
         progress(0.6, "choosing the smoothness")
         held = torch.randperm(len(points.positions), generator=generator) % _LEFT_OUT == 0
         foretold = []
@@ -218,10 +199,7 @@ def _fit_linear(
             progress(0.6, "choosing the smoothness")
             coarse = _fit_levels(points.where(~held), sides, _COARSE, tried, config.prior)
             foretold.append(_distance_off(points.where(held), coarse))
-        # The smoothest within one standard error of the best (Breiman et al., CART, 1984, section 3.4.3).
-        as_good = sum(min(foretold))
-        tries = zip(config.smoothness, foretold, strict=True)
-        smoothness, missed = max((tried, off) for tried, (off, _) in tries if off <= as_good)
+        missed, smoothness = min(zip(foretold, config.smoothness, strict=True))
         progress(0.8, f"fitting points on a grid of {config.nodes}^3")
         levels = (*(nodes for nodes in (*_COARSE, 96) if nodes < config.nodes), config.nodes)
         distance = _fit_levels(points, sides, levels, smoothness, config.prior)
@@ -245,27 +223,29 @@ def _fit_linear(
 
 
 def _fit_levels(
-    points: _Points,
-    sides: Float[Tensor, "coarse coarse coarse"],
-    levels: tuple[int, ...],
-    smoothness: float,
-    prior: float,
+    points: _Points, sides: Sides, levels: tuple[int, ...], smoothness: float, prior: float
 ) -> Float[Tensor, "nodes nodes nodes"]:
     """Grid by grid the smoothest field near the points' planes; far from points like `sides`.
 
     The energy of the same function grows with the cell, so that its weight grows with the nodes.
     """
-    distance = sides
+    distance = sides.distance
+    # The planes know better than the nearest point where points are near: it is noisy, and beside the gaps.
+    told = prior * -torch.expm1(-(sides.clearance / _CLEAR).square())
     for nodes in levels:
-        distance, like = refined(distance, nodes), refined(sides, nodes)
+        distance, like = refined(distance, nodes), refined(sides.distance, nodes)
         h = spacing(nodes)
         normals, weight = _facing(points, distance, h)
         measured = point_distances(*merged_points(points.positions, normals, weight, h / 2), nodes)
         measured_weight = measured.weight.clamp(max=4.0)
-        prior_weight = prior * (32 / nodes) ** 2
+        prior_weight = refined(told, nodes) * (32 / nodes) ** 2
         total = measured_weight + prior_weight
-        target = (measured_weight * measured.distance + prior_weight * like) / total
-        distance = fit_smooth(target, total, distance, smoothness=smoothness * nodes / 64, steps=40)
+        target = torch.where(
+            total > 0, (measured_weight * measured.distance + prior_weight * like) / total, like
+        )
+        distance = fit_smooth(
+            target, total, distance, smoothness=smoothness * nodes / 64, steps=_WORK // nodes
+        )
     return distance
 
 
@@ -288,16 +268,11 @@ def _facing(
     return F.normalize(share * sign * points.planes + (1 - share) * gradient, dim=-1), weight
 
 
-def _distance_off(points: _Points, distance: Float[Tensor, "nodes nodes nodes"]) -> tuple[float, float]:
-    """Mean distance of the points from the zero level, and its standard error.
-
-    To first order: |f| / |grad f|, weighted by trust.
-    """
+def _distance_off(points: _Points, distance: Float[Tensor, "nodes nodes nodes"]) -> float:
+    """Mean distance of the points from the zero level, weighted by trust; to first order |f| / |grad f|."""
     value, gradient = value_and_gradient(distance, locate(points.positions, len(distance)))
     off = value.abs() / torch.linalg.vector_norm(gradient, dim=-1).clamp(min=0.3)
-    share = points.trust / points.trust.sum()
-    mean = (share * off).sum()
-    return float(mean), float((share * (off - mean)).square().sum().sqrt())
+    return float((points.trust * off).sum() / points.trust.sum())
 
 
 def _decision(what: str, choice: str, because: str) -> Decision:

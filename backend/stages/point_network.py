@@ -40,6 +40,8 @@ class NetworkConfig:
     """Places a step, shared by the queries and what is tried around them. Published: 5000 queries."""
     learning_rate: float = 1e-3
     warm_up: int = 100
+    anywhere: float = 0.0
+    """Queries all over the cube, over those around points: only they meet surface far from points."""
     adversary: float = 1e-2
     """NAP: radius in which the worst query is looked for, in spreads of the queries."""
     draws: int = 5
@@ -106,7 +108,7 @@ def fit_network(
     """
     step_loss = METHODS[method]
     num_queries = config.batch // {"nap": 2, "sdro": 1 + config.draws}.get(method, 1)
-    queries = _draw_queries(points, generator)
+    queries = _draw_queries(points, config.anywhere, generator)
     network = DistanceNetwork(config.width, config.layers, generator).to(points.device)
     balance = nn.Parameter(torch.ones(2, device=points.device))  # NAP's own weights
     optimiser = torch.optim.Adam([*network.parameters(), balance], lr=config.learning_rate)
@@ -133,15 +135,18 @@ def fit_network(
     return values.reshape(nodes, nodes, nodes)
 
 
-def _draw_queries(points: Float[Tensor, "points 3"], generator: torch.Generator) -> Queries:
-    """About 200 000 places around the points, as far away as their neighbours are."""
+def _draw_queries(points: Float[Tensor, "points 3"], share: float, generator: torch.Generator) -> Queries:
+    """About 200 000 places around the points, as far away as their neighbours are, and some anywhere."""
     places = points.cpu().numpy()
     tree = cKDTree(places)
     spread, _ = tree.query(places, k=[min(NEIGHBOURS, len(places) - 1) + 1], workers=-1)
     times = max(1, 200_000 // len(places))
     widths = torch.tensor(spread[:, 0], dtype=points.dtype).repeat(times)
     noise = torch.randn((len(widths), 3), generator=generator, dtype=points.dtype)
-    positions = points.cpu().repeat(times, 1) + widths[:, None] * noise
+    around = points.cpu().repeat(times, 1) + widths[:, None] * noise
+    anywhere = torch.rand((int(share * len(around)), 3), generator=generator, dtype=points.dtype) * 2 - 1
+    positions = torch.cat([around, anywhere])
+    widths = torch.cat([widths, widths.mean().expand(len(anywhere))])
     _, nearest = tree.query(positions.numpy(), workers=-1)
     device = points.device
     return Queries(

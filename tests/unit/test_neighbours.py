@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from backend.maths.neighbours import against_neighbours, crowding, neighbour_planes
+from backend.maths.neighbours import against_neighbours, crowding, neighbour_planes, trusts
 
 
 def sphere(count: int, seed: int = 0) -> np.ndarray:
@@ -49,6 +49,17 @@ def test_strays_are_trusted_less_than_the_surface() -> None:
     assert np.median(trust[:1000]) > 0.6
     assert np.median(trust[1000:][far]) < 0.15
     assert ((trust > 0) & (trust <= 1)).all()
+
+
+def test_a_sheet_of_few_points_is_trusted_and_strays_are_not() -> None:
+    """A sixteenth of the density: by crowding alone such a point would have 1 / (1 + 8^2)."""
+    rng = np.random.default_rng(1)
+    few = np.column_stack([rng.uniform(-2, 2, (150, 2)), np.full(150, 3.0)])
+    strays = rng.uniform([-2, -2, -6], [2, 2, -2], (150, 3))
+    trust = trusts(np.concatenate([sphere(2000), few, strays]))
+    assert np.median(crowding(np.concatenate([sphere(2000), few]))[2000:]) < 0.05
+    assert np.median(trust[2000:2150]) > 0.9
+    assert np.median(trust[2150:]) < 0.25
 
 
 def test_a_flipped_normal_is_against_its_neighbours() -> None:

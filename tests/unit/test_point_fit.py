@@ -11,13 +11,16 @@ from backend.errors import Cancelled, ErrorCode, ReconstructionError
 from backend.scene import SurfaceMesh, no_progress
 from backend.stages.mesh import MeshConfig
 from backend.stages.point_cloud import PointCloud, clean_cloud
-from backend.stages.point_fit import PointFitConfig, fit_points, mesh_of_points
+from backend.stages.point_fit import PointFitConfig, fit_points
+from backend.stages.point_mesh import mesh_of_points
 from backend.stages.point_network import METHODS, NetworkConfig
 
 CPU = torch.device("cpu")
 QUICK = PointFitConfig(
     nodes=64,
-    sides=NetworkConfig(width=32, layers=3, steps=300, batch=500, learning_rate=5e-3, warm_up=30),
+    sides=NetworkConfig(
+        width=32, layers=3, steps=300, batch=500, learning_rate=5e-3, warm_up=30, anywhere=0.25
+    ),
     network=NetworkConfig(width=32, layers=3, steps=400, batch=1000),
 )
 CENTRE, RADIUS = np.array([50.0, -20.0, 3.0]), 4.0
@@ -72,6 +75,27 @@ def test_a_torus_keeps_its_hole() -> None:
     to_circle = np.linalg.norm(mesh.vertices[:, :2], axis=1) - 1
     off = np.abs(np.hypot(to_circle, mesh.vertices[:, 2]) - TUBE)
     assert off.mean() < 0.01
+
+
+def test_a_bore_seen_by_few_points_stays_open() -> None:
+    """As a scanner sees a pipe: the bore has an eighth of the density outside."""
+    rng = np.random.default_rng(0)
+    bore, outer, half_length = 0.35, 0.6, 0.3
+
+    def mantle(radius: float, count: int) -> np.ndarray:
+        turn, z = rng.uniform(0, 2 * np.pi, count), rng.uniform(-half_length, half_length, count)
+        return np.stack([radius * np.cos(turn), radius * np.sin(turn), z], axis=1)
+
+    def end(z: float, count: int) -> np.ndarray:
+        turn, radius = rng.uniform(0, 2 * np.pi, count), np.sqrt(rng.uniform(bore**2, outer**2, count))
+        return np.stack([radius * np.cos(turn), radius * np.sin(turn), np.full(count, z)], axis=1)
+
+    seen = [mantle(outer, 4000), mantle(bore, 300), end(-half_length, 400), end(half_length, 400)]
+    mesh = fitted(clean_cloud(np.concatenate(seen), None))
+    assert closed(mesh).euler_number == 0
+    across, along = np.linalg.norm(mesh.vertices[:, :2], axis=1), np.abs(mesh.vertices[:, 2])
+    inside_bore = np.minimum(bore - across, half_length - along)
+    assert inside_bore.max() < 0.05
 
 
 def test_known_normals_are_met() -> None:
