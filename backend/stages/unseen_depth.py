@@ -11,6 +11,9 @@ from .unseen_side import DEEPEST, depth_is_bounded, explained_radius, widest_vie
 _NODES = 48
 _ROUNDS = 6
 """Of each trial."""
+_MENDED = 0.05
+"""Share of the rays through the subject that may be missed so: the pull of silhouettes mends as many. A
+deeper ball than needed is worse than that, most of all for what is not seen."""
 _GROWTH = 1.2
 """From one trial to the next."""
 _MARGIN = 1.4
@@ -46,7 +49,10 @@ def _met_radius(scene: Measurements, explained: float, config: LinearConfig) -> 
         trial = fit_level(scene, start(scene, radius, _NODES), radius, _ROUNDS, alone)
         return int(missing(rays, trial).sum())
 
-    radius, tolerated = explained, 1.1 * num_missed(DEEPEST) + 3
+    unavoidable = num_missed(DEEPEST)
+    if num_missed(explained) - unavoidable <= _MENDED * len(rays.origins):
+        return explained
+    radius, tolerated = _GROWTH * explained, 1.1 * unavoidable + 3
     while radius < DEEPEST and num_missed(radius) > tolerated:
-        radius = min(_GROWTH * radius, DEEPEST)
-    return radius if radius == explained else min(_MARGIN * radius, DEEPEST)
+        radius *= _GROWTH
+    return min(_MARGIN * radius, DEEPEST)
