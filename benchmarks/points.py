@@ -23,13 +23,13 @@ import torch
 import trimesh
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import breadth_first_order, connected_components, minimum_spanning_tree
-from scipy.spatial import cKDTree
 
 from backend.benchmark.summary import markdown
 from backend.commands.fit_points import POINT_METHODS
 from backend.errors import ReconstructionError
 from backend.machine import choose_device, set_up_torch
 from backend.maths.metrics import TrueSurface, load_truth, surface_error
+from backend.maths.nearest import nearest_tree
 from backend.maths.neighbours import neighbour_planes
 from backend.scene import SurfaceMesh, no_progress
 from backend.stages.mesh import MeshConfig, vertex_normals
@@ -123,7 +123,7 @@ def consistent_normals(positions: np.ndarray) -> np.ndarray:
     """Planes of neighbours, turned alike along the spanning tree of least turning (Hoppe et al., 1992)."""
     normals = neighbour_planes(positions).normals.copy()
     count = len(positions)
-    _, index = cKDTree(positions).query(positions, k=20)
+    _, index = nearest_tree(positions).query(positions, k=20)
     start, end = np.repeat(np.arange(count), 19), index[:, 1:].ravel()
     cost = 1 - np.abs((normals[start] * normals[end]).sum(axis=1)) + 1e-4
     links = coo_array((cost, (start, end)), shape=(count, count)).tocsr()

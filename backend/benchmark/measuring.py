@@ -142,7 +142,7 @@ def measure(
         inputs=inputs,
     )
     if exit_code:
-        words = " ".join(last_lines) or f"ended with exit code {exit_code}"
+        words = " ".join([f"ended with exit code {exit_code}:", *last_lines])
         return done(numbers={}, versions={}, failure=words)
     report = json.loads((output / "report.json").read_text(encoding="utf-8"))
     numbers = {**report_numbers(report), "wall_s": wall_s}

@@ -21,11 +21,11 @@ from typing import Any
 import numpy as np
 import trimesh
 from jaxtyping import Bool, Float, Float32, Float64, Int64
-from scipy.spatial import cKDTree
 
 from ..errors import ErrorCode, ReconstructionError
 from ..scene import Camera, SurfaceMesh
 from .calibration import Calibration, calibration
+from .nearest import nearest_tree
 from .raycast import RayCaster, interpolate, intersect_planes, visible_from
 
 READ_FAILURES = (
@@ -221,7 +221,7 @@ def _seen(samples: _Samples, cameras: Sequence[Camera], caster: RayCaster) -> Bo
 def _nearest(
     points: Float64[np.ndarray, "points 3"], others: Float64[np.ndarray, "others 3"]
 ) -> tuple[Float64[np.ndarray, "points"], Int64[np.ndarray, "points"]]:
-    distance, index = cKDTree(others).query(points, workers=-1)
+    distance, index = nearest_tree(others).query(points, workers=-1)
     return distance, index
 
 

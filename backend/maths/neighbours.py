@@ -4,7 +4,8 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float64
-from scipy.spatial import cKDTree
+
+from .nearest import nearest_tree
 
 
 class Planes(NamedTuple):
@@ -18,7 +19,7 @@ class Planes(NamedTuple):
 
 def neighbour_planes(points: Float64[np.ndarray, "points 3"], count: int = 20) -> Planes:
     """From the principal axes of `count` neighbours, the point included (Hoppe et al., SIGGRAPH 1992)."""
-    _, index = cKDTree(points).query(points, k=min(count, len(points)), workers=-1)
+    _, index = nearest_tree(points).query(points, k=min(count, len(points)), workers=-1)
     around = points[index]
     around -= around.mean(axis=1, keepdims=True)
     variance, axes = np.linalg.eigh(np.einsum("pki,pkj->pij", around, around))
@@ -34,7 +35,7 @@ def crowding(points: Float64[np.ndarray, "points 3"], count: int = 12) -> Float6
     a half. Up to half of the cloud may be strays that lie in the open.
     """
     count = min(count, len(points) - 1)
-    reach, _ = cKDTree(points).query(points, k=[count + 1], workers=-1)
+    reach, _ = nearest_tree(points).query(points, k=[count + 1], workers=-1)
     area = reach[:, 0] ** 2
     usual = np.quantile(area, 0.25)
     return np.asarray(1 / (1 + (area / (2 * max(usual, np.finfo(float).tiny))) ** 2))
@@ -46,7 +47,7 @@ def sheetness(points: Float64[np.ndarray, "points 3"], count: int = 20) -> Float
     The mean square thickness of `count` neighbours and the square of the point's own distance from their
     plane are held against their middle variance: a quarter of it is a half.
     """
-    _, index = cKDTree(points).query(points, k=min(count + 1, len(points)), workers=-1)
+    _, index = nearest_tree(points).query(points, k=min(count + 1, len(points)), workers=-1)
     around = points[index[:, 1:]]
     middle = around.mean(axis=1, keepdims=True)
     around -= middle
@@ -69,5 +70,5 @@ def against_neighbours(
     points: Float64[np.ndarray, "points 3"], normals: Float64[np.ndarray, "points 3"], count: int = 8
 ) -> Bool[np.ndarray, "points"]:
     """True where a normal points away from the mean of its neighbours' normals."""
-    _, index = cKDTree(points).query(points, k=min(count, len(points)), workers=-1)
+    _, index = nearest_tree(points).query(points, k=min(count, len(points)), workers=-1)
     return np.asarray((normals[index[:, 1:]].sum(axis=1) * normals).sum(axis=1) < 0)

@@ -22,6 +22,7 @@ from torch import Tensor
 from .conjugate_gradients import conjugate_gradients
 from .evidence import merged_points
 from .grid import Corners, interpolate, locate, node_positions, spacing, splat
+from .nearest import nearest_tree
 
 _TRUST = 0.03
 """In the field so far at a node; an edge half as far from points as they are apart has 1."""
@@ -70,7 +71,7 @@ def sides_by_walking(
     sides are asked for four such lengths apart.
     """
     nodes, h = len(field), spacing(len(field))
-    tree = cKDTree(points.cpu().numpy())
+    tree = nearest_tree(points.cpu().numpy())
     distance, apart = _distance_and_spacing(tree, node_positions(nodes, torch.device("cpu")))
     distance, apart = distance.to(field), apart.to(field)
     openness = (distance / (apart / 2).clamp(min=h)).clamp(min=_CLOSEST)

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from ..maths.evidence import PointDistances, merged_points, point_distances, seen_through
 from ..maths.grid import locate, spacing, splat
+from ..maths.nearest import nearest_tree
 from ..maths.smooth_fit import fit_smooth
 from .measurements import Measurements
 from .rims import RimRays, rim_points, rim_rays
@@ -68,7 +69,7 @@ def fit_level(
     free = bound > 0
     through = _seen_through_any(scene, nodes, 3 * h)
     through_subject, pulled = silhouette_rays(scene, bound), torch.zeros((nodes**3, 2), device=before.device)
-    rays, nearest = rim_rays(scene, nodes), cKDTree(points[0].cpu().numpy())
+    rays, nearest = rim_rays(scene, nodes), nearest_tree(points[0].cpu().numpy())
     distance = before
     for _ in range(rounds):
         target, weight = before.clone(), torch.full_like(before, config.prior * (32 / nodes) ** 2)

@@ -11,11 +11,11 @@ import numpy as np
 import torch
 import trimesh
 from jaxtyping import Bool, Float32, Float64, Int64
-from scipy.spatial import cKDTree
 from skimage.measure import marching_cubes
 
 from ..errors import ErrorCode, ReconstructionError
 from ..maths.grid import near_surface, refined, spacing
+from ..maths.nearest import nearest_tree
 from ..maths.pieces import connected_pieces
 from ..maths.raycast import RayCaster, visible_from
 from ..scene import Decision, Progress, Region, SurfaceMesh, View, transform_points
@@ -128,7 +128,7 @@ def preview_mesh(
         nodes = min(nodes - 1, int(nodes * (PREVIEW_FACES / len(faces)) ** 0.5))
     colours = np.full((len(vertices), 3), 128, np.uint8)
     if len(points):
-        _, nearest = cKDTree(points).query(vertices)
+        _, nearest = nearest_tree(points).query(vertices)
         colours = np.clip(colours_srgb[nearest] * 255 + 0.5, 0, 255).astype(np.uint8)
     return SurfaceMesh(
         vertices=vertices,
@@ -258,7 +258,7 @@ def measured_share(
     if not len(points):
         return np.zeros(len(vertices))
     # beyond, the bell is less than 1e-10; a search without a bound is slow where no point is near
-    distance, nearest = cKDTree(points).query(
+    distance, nearest = nearest_tree(points).query(
         vertices, k=min(8, len(points)), distance_upper_bound=7.5 * cell, workers=-1
     )
     near = np.exp(-((np.atleast_2d(distance.T).T / (1.5 * cell)) ** 2))
@@ -284,7 +284,7 @@ def _open_or_closed(
     if at_edges < MEASURED_EDGES or not measured.any():
         decision = Decision(what="back side", choice="closed smoothly", because=because)
         return np.ones(len(faces), bool), decision
-    distance, _ = cKDTree(vertices[measured]).query(vertices, workers=-1)
+    distance, _ = nearest_tree(vertices[measured]).query(vertices, workers=-1)
     keep_vertex = distance < 5 * cell
     decision = Decision(what="back side", choice="cut off", because=f"{because}: a piece of a larger scene")
     return keep_vertex[faces].all(axis=1), decision

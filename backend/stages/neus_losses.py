@@ -10,6 +10,7 @@ from torch import Tensor
 
 from ..maths import losses
 from ..maths.gradients import analytic_gradient, central_gradient
+from ..maths.nearest import nearest_tree
 from ..maths.radiance import composite
 from ..maths.rays import sphere_span
 from ..maths.surface_samples import surface_samples
@@ -87,7 +88,7 @@ def measured_points(scene: Measurements) -> MeasuredPoints:
         normals=scene.normals[near],
         colours=scene.colours[near],
         upto=summed / summed[-1],
-        tree=cKDTree(positions.cpu().numpy()),
+        tree=nearest_tree(positions.cpu().numpy()),
     )
 
 

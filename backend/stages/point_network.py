@@ -11,12 +11,12 @@ from itertools import pairwise
 
 import torch
 from jaxtyping import Float
-from scipy.spatial import cKDTree
 from torch import Tensor, nn
 from torch.nn.functional import softplus
 
 from ..maths.grid import node_positions
 from ..maths.losses import entropy_of_side, log_mean_exp, newton_pull, pull, worst_offset
+from ..maths.nearest import nearest_tree
 from ..scene import Progress
 
 NEIGHBOURS = 50
@@ -138,7 +138,7 @@ def fit_network(
 def _draw_queries(points: Float[Tensor, "points 3"], share: float, generator: torch.Generator) -> Queries:
     """About 200 000 places around the points, as far away as their neighbours are, and some anywhere."""
     places = points.cpu().numpy()
-    tree = cKDTree(places)
+    tree = nearest_tree(places)
     spread, _ = tree.query(places, k=[min(NEIGHBOURS, len(places) - 1) + 1], workers=-1)
     times = max(1, 200_000 // len(places))
     widths = torch.tensor(spread[:, 0], dtype=points.dtype).repeat(times)

@@ -4,9 +4,9 @@ import math
 
 import numpy as np
 from jaxtyping import Bool, Float64, UInt8
-from scipy.spatial import cKDTree
 
 from ..maths.exposure import disagreement, log_exposures
+from ..maths.nearest import nearest_tree
 from ..maths.sampling import colours_at
 from ..maths.srgb import linear_from_srgb, srgb_from_linear
 from ..scene import Decision, View
@@ -50,7 +50,7 @@ def colour_vertices(
     known = weight > 0
     colours = (share[..., None] * srgb).sum(axis=0) / np.where(known, weight, 1.0)[:, None]
     if known.any() and not known.all():
-        distance, nearest = cKDTree(vertices[known]).query(vertices[~known], k=min(16, int(known.sum())))
+        distance, nearest = nearest_tree(vertices[known]).query(vertices[~known], k=min(16, int(known.sum())))
         near = 1 / (np.atleast_2d(distance.T).T + 1e-3 * np.ptp(vertices))
         mixed = (near[..., None] * colours[known][np.atleast_2d(nearest.T).T]).sum(axis=1)
         colours[~known] = mixed / near.sum(axis=1, keepdims=True)
