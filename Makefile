@@ -71,7 +71,7 @@ SEEDS ?= $(if $(filter quick,$(SUITE)),1,3)
 BUDGETS ?=
 DATA ?= $(wildcard ../shared/data)
 
-# Renders what is missing or out of date, then measures from nothing.
+# Renders what is missing or out of date, then measures what is not known yet or has changed.
 benchmark: .venv/.ready .venv-blender/.ready
 	$(BPY) -m benchmarks.render_scenes $(SUITE) --output $(BENCHMARK)/scenes $(if $(DATA),--data $(DATA))
 	$(BACKEND) -m backend benchmark $(SUITE) --output $(BENCHMARK)/$(SUITE) --seeds $(SEEDS) \

@@ -86,8 +86,14 @@ def _measure_all(parsed: argparse.Namespace, program: tuple[str, ...], request: 
         for preset, budget_s, seed in product(parsed.presets, [None, *parsed.budgets], range(parsed.seeds))
     ]
     runs = measured_before(parsed.output, found, parsed.device, machine)
+
+    def write() -> None:
+        asked_first = dict.fromkeys((*trials, *runs))
+        write_results(parsed.output, about, [runs[trial] for trial in asked_first if trial in runs])
+
     if runs:
         _say(f"Kept from before, as nothing that it depends on has changed: {len(runs)}.")
+        write()
     for trial in trials:
         if trial not in runs:
             runs[trial] = measure(
@@ -98,9 +104,7 @@ def _measure_all(parsed: argparse.Namespace, program: tuple[str, ...], request: 
                 request=request,
             )
             _say(_line(runs[trial]))
-        write_results(
-            parsed.output, about, [runs[known] for known in dict.fromkeys((*trials, *runs)) if known in runs]
-        )
+            write()
     sys.stdout.write(f"{parsed.output / 'table.md'}\n")
 
 

@@ -16,7 +16,6 @@ from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
-from scipy.spatial import cKDTree
 from torch import Tensor
 
 from .conjugate_gradients import conjugate_gradients
@@ -72,8 +71,9 @@ def sides_by_walking(
     """
     nodes, h = len(field), spacing(len(field))
     tree = nearest_tree(points.cpu().numpy())
-    distance, apart = _distance_and_spacing(tree, node_positions(nodes, torch.device("cpu")))
-    distance, apart = distance.to(field), apart.to(field)
+    around, _ = tree.query(tree.data, k=[min(_NEIGHBOUR + 1, tree.n)], workers=-1)
+    far, nearest = tree.query(node_positions(nodes, torch.device("cpu")).numpy(), workers=-1)
+    distance, apart = torch.as_tensor(far).to(field), torch.as_tensor(around[nearest, 0]).to(field)
     openness = (distance / (apart / 2).clamp(min=h)).clamp(min=_CLOSEST)
     conductance = [
         ((openness.narrow(axis, 1, nodes - 1) + openness.narrow(axis, 0, nodes - 1)) / 2)
@@ -86,7 +86,8 @@ def sides_by_walking(
     trust = torch.where(outer, _OUTSIDE, torch.full_like(field, _TRUST))
     side = torch.where(outer, 1.0, torch.tanh(field / h))
     merged, direction, share = merged_points(points, normals, weight, h)
-    step = _distance_and_spacing(tree, merged.cpu())[1].to(field).clamp(min=2 * h)[:, None] * direction
+    _, nearest = tree.query(merged.cpu().numpy(), workers=-1)
+    step = torch.as_tensor(around[nearest, 0]).to(field).clamp(min=2 * h)[:, None] * direction
     crossings = Crossings(
         one=locate(merged + step, nodes),
         other=locate(merged - step, nodes),
@@ -131,12 +132,3 @@ def random_walk(
         own = crossings.weight[:, None] * place.weight.square()
         diagonal.view(-1).index_add_(0, place.index.flatten(), own.flatten())
     return conjugate_gradients(apply, diagonal, trust * side, side, steps=steps)
-
-
-def _distance_and_spacing(
-    tree: cKDTree, places: Float[Tensor, "*shape 3"]
-) -> tuple[Float[Tensor, "*shape"], Float[Tensor, "*shape"]]:
-    """How far each place is from its nearest point, and how far that one's neighbours are from it."""
-    reach, _ = tree.query(tree.data, k=[min(_NEIGHBOUR + 1, tree.n)], workers=-1)
-    distance, nearest = tree.query(places.numpy(), workers=-1)
-    return torch.as_tensor(distance), torch.as_tensor(reach[nearest, 0])
