@@ -37,11 +37,11 @@ class HeldOutFit:
     """Of the mask, or of the picture where there is none."""
 
 
-def held_out_views(case: Case, folder: Path) -> tuple[View, ...]:
-    """The case's held-out photographs with their cameras, undistorted. Raises ReconstructionError."""
+def known_views(case: Case, folder: Path, indices: tuple[int, ...]) -> tuple[View, ...]:
+    """Photographs of a case with their known cameras, undistorted. Raises ReconstructionError."""
     assert case.cameras is not None
     masks = None if case.masks is None else folder / case.masks
-    paths = image_paths(case, folder, case.held_out)
+    paths = image_paths(case, folder, indices)
     photos = load_photos(paths, masks, PhotosConfig(max_side_px=MAX_SIDE_PX), progress=no_progress)
     with TemporaryDirectory() as scratch:
         return solve_cameras(

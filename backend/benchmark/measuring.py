@@ -16,15 +16,18 @@ from ..commands.cancelling import CancelRequest
 from ..commands.child import run_child
 from ..errors import ReconstructionError
 from ..machine import choose_device
+from ..maths.metrics import load_truth
 from ..mesh_files import read_mesh
 from ..pipeline import code_fingerprint
 from ..presets import PRESETS
 from ..records import load_record
 from ..results import RADIANCE
 from ..stages.radiance_field import Radiance
+from ..stages.report import error_numbers
 from ..wire.client import ROOT, clean_environment
 from ..workspace import fingerprint
-from .held_out import held_out_fit, held_out_radiance_fit, held_out_views
+from .among_surroundings import error_of_subject
+from .held_out import held_out_fit, held_out_radiance_fit, known_views
 from .suites import Case, Found, image_paths, with_budget
 
 _WITH_KNOWN_CAMERAS = ("region", "stereo", "train", "mesh")
@@ -81,9 +84,7 @@ class Measurement:
 def inputs_of(trial: Trial, machine: Mapping[str, object]) -> str:
     """Changes with the code, the preset's settings, the case's files and the machine."""
     case, folder = trial.case, trial.folder
-    given = [
-        folder / name for name in (case.images, case.cameras, case.masks, case.truth) if name is not None
-    ]
+    given = [folder / name for name in (case.images, *case.files)]
     settings = dataclasses.replace(trial, folder=Path(case.folder)), PRESETS[trial.preset]
     return fingerprint(code_fingerprint(), settings, sorted(machine.items()), *given)
 
@@ -147,11 +148,13 @@ def measure(
     report = json.loads((output / "report.json").read_text(encoding="utf-8"))
     numbers = {**report_numbers(report), "wall_s": wall_s}
     failure = None
-    if trial.case.held_out:
-        try:
+    try:
+        if trial.case.held_out:
             numbers |= _held_out_numbers(trial, output)
-        except ReconstructionError as error:
-            failure = str(error)
+        if trial.case.surroundings is not None:
+            numbers |= _errors_of_subject(trial, output)
+    except ReconstructionError as error:
+        failure = str(error)
     return done(numbers=numbers, versions=report["versions"], failure=failure)
 
 
@@ -190,10 +193,26 @@ def flat_errors(error: Mapping[str, Any]) -> dict[str, float | None]:
 
 
 def _held_out_numbers(trial: Trial, output: Path) -> dict[str, float | None]:
-    views = held_out_views(trial.case, trial.folder)
+    views = known_views(trial.case, trial.folder, trial.case.held_out)
     if (output / RADIANCE).is_file():
         device = choose_device(trial.device)
         fit = held_out_radiance_fit(load_record(output / RADIANCE, Radiance), views, device)
     else:
         fit = held_out_fit(read_mesh(output / "mesh.ply"), views)
     return {"held_out_psnr_db": fit.psnr_db, "held_out_covered_share": fit.covered_share}
+
+
+def _errors_of_subject(trial: Trial, output: Path) -> dict[str, float | None]:
+    """In place of the report's errors, which count what is true of the surroundings as wrong."""
+    case, folder = trial.case, trial.folder
+    assert case.truth is not None
+    assert case.surroundings is not None
+    error = error_of_subject(
+        read_mesh(output / "mesh.ply"),
+        load_truth(folder / case.truth),
+        load_truth(folder / case.surroundings),
+        cameras=[view.camera for view in known_views(case, folder, case.given)],
+        seed=trial.seed,
+        num_samples=PRESETS[trial.preset].report.error_samples,
+    )
+    return flat_errors({} if error is None else error_numbers(error))

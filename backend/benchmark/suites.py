@@ -37,14 +37,24 @@ class Case:
     """None where they are to be estimated."""
     masks: str | None = None
     truth: str | None = None
+    surroundings: str | None = None
+    """The true mesh of what is in the pictures beside the subject; not part of `truth`."""
     rendering: Rendering | None = None
     """None for real photographs."""
+
+    @property
+    def files(self) -> tuple[str, ...]:
+        """All that is read beside the images."""
+        named = (self.cameras, self.masks, self.truth, self.surroundings)
+        return tuple(name for name in named if name is not None)
 
     def __post_init__(self) -> None:
         if set(self.given) & set(self.held_out):
             raise ValueError(f"{self.name}: images are both given and held out")
         if self.held_out and (self.cameras is None or len(self.held_out) < 2):
             raise ValueError(f"{self.name}: held-out images need known cameras, and there must be two")
+        if self.surroundings is not None and (self.truth is None or self.cameras is None):
+            raise ValueError(f"{self.name}: surroundings need a truth to be told from, and known cameras")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -94,14 +104,18 @@ def _all_images(case: Case, folder: Path) -> list[Path]:
 
 
 def _is_complete(case: Case, folder: Path) -> bool:
-    files = [name for name in (case.cameras, case.truth, case.masks) if name is not None]
-    if not (folder / case.images).is_dir() or not all((folder / name).exists() for name in files):
+    if not (folder / case.images).is_dir() or not all((folder / name).exists() for name in case.files):
         return False
     return len(_all_images(case, folder)) > max(case.given + case.held_out)
 
 
 def rendered_case(
-    scene: str, num_given: int, *, name: str | None = None, words: tuple[str, ...] = ()
+    scene: str,
+    num_given: int,
+    *,
+    name: str | None = None,
+    words: tuple[str, ...] = (),
+    surroundings: str | None = None,
 ) -> Case:
     """Views along an arc (3 over 40 degrees, 6 over 120) or a ring, and between them those held out."""
     is_ring = num_given > 6
@@ -115,11 +129,12 @@ def rendered_case(
         given=tuple(range(0, total, 2)),
         held_out=tuple(range(1, total, 2)),
         truth="truth.ply",
+        surroundings=surroundings,
         rendering=Rendering(scene=scene, words=("--views", str(total), *layout, *words)),
     )
 
 
-_SCENES = ("monkey", "glossy", "plaster", "thin", "genus2", "spots", "table")
+_SCENES = ("monkey", "glossy", "plaster", "thin", "genus2", "spots")
 _MESHES = (
     # The cow looks the other way and is nearly white.
     ("cow", "mesh_spot/spot.obj", ("--turn-deg", "180", "--exposure-stops", "-0.6")),
@@ -163,6 +178,7 @@ SUITES = MappingProxyType(
                 name="scenes",
                 cases=(
                     *(rendered_case(scene, count) for scene in _SCENES for count in _NUM_VIEWS),
+                    *(rendered_case("table", n, surroundings="surroundings.ply") for n in _NUM_VIEWS),
                     *(
                         rendered_case(path, count, name=name, words=words)
                         for name, path, words in _MESHES

@@ -7,7 +7,7 @@ import pytest
 import torch
 import trimesh
 
-from backend.benchmark.held_out import held_out_fit, held_out_radiance_fit, held_out_views
+from backend.benchmark.held_out import held_out_fit, held_out_radiance_fit, known_views
 from backend.benchmark.suites import Case
 from backend.maths.raycast import render_mesh
 from backend.scene import Camera, Region, SurfaceMesh, View
@@ -77,11 +77,11 @@ def test_an_empty_mask_has_no_number() -> None:
     assert fit.covered_share == 0.0
 
 
-def test_the_views_are_those_that_are_held_out(tmp_path: Path) -> None:
+def test_the_views_are_those_that_are_asked_for(tmp_path: Path) -> None:
     scene = photographed(ring_cameras(5, 48))
     write_scene(scene, tmp_path)
     case = Case(name="a", folder="a", given=(0, 2, 4), held_out=(1, 3), cameras="images/transforms.json")
-    found = held_out_views(case, tmp_path)
+    found = known_views(case, tmp_path, case.held_out)
     assert [view.name for view in found] == [scene.views[index].name for index in (1, 3)]
     for view, index in zip(found, (1, 3), strict=True):
         np.testing.assert_allclose(

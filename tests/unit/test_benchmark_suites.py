@@ -16,9 +16,8 @@ def filled(case: Case, folder: Path, num_images: int) -> Path:
     (folder / case.images).mkdir(parents=True)
     for index in range(num_images):
         (folder / case.images / f"{index:03d}.png").touch()
-    for name in (case.cameras, case.truth, case.masks):
-        if name is not None:
-            (folder / name).touch()
+    for name in case.files:
+        (folder / name).touch()
     return folder
 
 
@@ -50,6 +49,11 @@ def test_held_out_images_need_cameras_and_company(changes: dict[str, object]) ->
     case = Case(name="a", folder="a", given=(0, 2))
     with pytest.raises(ValueError, match="held-out images need"):
         replace(case, **changes)
+
+
+def test_surroundings_are_told_from_a_truth() -> None:
+    with pytest.raises(ValueError, match="surroundings need a truth"):
+        Case(name="a", folder="a", given=(0, 2), surroundings="room.ply")
 
 
 @pytest.mark.parametrize(("num_given", "total", "kind"), [(3, 5, "40"), (6, 11, "120"), (12, 24, "ring")])
