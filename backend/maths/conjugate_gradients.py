@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -21,13 +22,20 @@ def conjugate_gradients(
     solution = start.clone()
     residual = right - apply(solution)
     direction = residual / diagonal
-    energy = (residual * direction).sum()
+    energy = _product(residual, direction)
     for _ in range(steps):
         image = apply(direction)
-        step = energy / (direction * image).sum().clamp(min=1e-30)
-        solution += step * direction
-        residual -= step * image
+        step = energy / _product(direction, image).clamp(min=1e-30)
+        solution.addcmul_(step, direction)
+        residual.addcmul_(step, image, value=-1)
         conditioned = residual / diagonal
-        before, energy = energy, (residual * conditioned).sum()
-        direction = conditioned + (energy / before.clamp(min=1e-30)) * direction
+        before, energy = energy, _product(residual, conditioned)
+        direction = conditioned.addcmul_(energy / before.clamp(min=1e-30), direction)
     return solution
+
+
+def _product(
+    a: Float[Tensor, "nodes nodes nodes"], b: Float[Tensor, "nodes nodes nodes"]
+) -> Float[Tensor, ""]:
+    """Of two fields as vectors, without a third to hold the terms."""
+    return torch.dot(a.flatten(), b.flatten())

@@ -15,6 +15,11 @@ from torch import Tensor
 from .geometry import Pinhole, inside, project, sample_image
 from .grid import node_positions, spacing
 
+_BATCH = 8192
+"""Points whose distances to all nodes around them are computed at once: few enough for a core's cache."""
+_BEYOND = 3
+"""Nodes around the grid that points at its border speak to; nobody reads them."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class PointDistances:
@@ -33,24 +38,29 @@ def point_distances(
 ) -> PointDistances:
     """Weighted mean of n . (q - p) over the points within two cells of each node q."""
     h = spacing(nodes)
-    base = ((positions + 1) / h).floor().long()
-    sums = positions.new_zeros((nodes**3, 2))
-    for offset in _offsets(-1, 2, positions.device):
-        node = base + offset
-        valid = ((node >= 0) & (node < nodes)).all(dim=-1)
-        node = node[valid]
-        apart = node * h - 1 - positions[valid]
-        along = (apart * normals[valid]).sum(dim=-1)
-        across2 = (apart * apart).sum(dim=-1) - along * along
-        weight = confidence[valid] * torch.exp(-across2 / (h * h)) * torch.exp(-((along / (2 * h)) ** 2))
-        flat = (node[:, 0] * nodes + node[:, 1]) * nodes + node[:, 2]
-        sums.index_add_(0, flat, torch.stack([weight * along, weight], dim=-1))
-    weight = sums[:, 1]
-    distance = sums[:, 0] / weight.clamp(min=1e-6)
-    shape = (nodes, nodes, nodes)
-    return PointDistances(
-        distance=distance.reshape(shape), weight=torch.where(weight > 1e-3, weight, 0.0).reshape(shape)
-    )
+    padded = nodes + 2 * _BEYOND
+    cells = (positions + 1) / h
+    near = ((cells > -2) & (cells < nodes + 1)).all(dim=-1)
+    offsets = _offsets(-1, 2, positions.device)
+    strides = offsets.new_tensor([padded * padded, padded, 1])
+    steps, offset_at = offsets.to(positions.dtype), offsets @ strides
+    sums = positions.new_zeros((padded**3, 2))
+    batches = (torch.split(column[near], _BATCH) for column in (cells, normals, confidence))
+    for place, normal, sure in zip(*batches, strict=True):
+        base = place.floor()
+        # lengths in cells: a node o beside the base is o - f from the point, n . (o - f) along its normal
+        f = place - base
+        along = normal @ steps.T - (f * normal).sum(dim=-1, keepdim=True)
+        apart2 = steps.square().sum(dim=-1) - 2 * f @ steps.T + f.square().sum(dim=-1, keepdim=True)
+        # a Gaussian that is one cell wide across the normal, two along it
+        weight = sure[:, None] * torch.exp(0.75 * along * along - apart2)
+        at = ((base.long() + _BEYOND) @ strides)[:, None] + offset_at
+        terms = torch.stack([weight * along, weight], dim=-1)
+        sums.index_add_(0, at.flatten(), terms.flatten(0, 1))
+    inner = slice(_BEYOND, _BEYOND + nodes)
+    total, weight = sums.reshape(padded, padded, padded, 2)[inner, inner, inner].unbind(-1)
+    distance = h * total / weight.clamp(min=1e-6)
+    return PointDistances(distance=distance, weight=torch.where(weight > 1e-3, weight, 0.0))
 
 
 def merged_points(

@@ -13,7 +13,7 @@ from ..maths.nearest import nearest_tree
 from ..maths.smooth_fit import fit_smooth
 from .measurements import Measurements
 from .rims import RimRays, rim_points, rim_rays
-from .silhouettes import SilhouetteRays, least_distance, missing, silhouette_rays
+from .silhouettes import SilhouetteRays, inside_along, least_distance, silhouette_rays
 from .unseen_side import ball_behind, depth_is_bounded
 
 _FADE = 0.7
@@ -69,6 +69,7 @@ def fit_level(
     free = bound > 0
     through = _seen_through_any(scene, nodes, 3 * h)
     through_subject, pulled = silhouette_rays(scene, bound), torch.zeros((nodes**3, 2), device=before.device)
+    met_along = torch.full_like(through_subject.entry, torch.inf)
     rays, nearest = rim_rays(scene, nodes), nearest_tree(points[0].cpu().numpy())
     distance = before
     for _ in range(rounds):
@@ -77,7 +78,8 @@ def fit_level(
         target[carved], weight[carved] = bound[carved], config.free_space
         carved = through & (distance < 2 * h)
         target[carved], weight[carved] = 2 * h, config.seen_through
-        pulled = _FADE * pulled + _pulls(through_subject, distance)
+        met_along = inside_along(through_subject, distance, met_along)
+        pulled = _FADE * pulled + _pulls(through_subject, met_along.isinf(), nodes)
         rays_near, depths = pulled.reshape(*distance.shape, 2).unbind(-1)
         pull = config.silhouettes * rays_near.clamp(max=1.0) * ~free
         inside = depths / rays_near.clamp(min=1e-6)
@@ -92,11 +94,9 @@ def fit_level(
     return distance
 
 
-def _pulls(rays: SilhouetteRays, distance: Float[Tensor, "nodes nodes nodes"]) -> Float[Tensor, "cells 2"]:
+def _pulls(rays: SilhouetteRays, missed: Bool[Tensor, "rays"], nodes: int) -> Float[Tensor, "cells 2"]:
     """At the nodes around the middles of rays that miss the field: 1 for each, and how deep it should be."""
-    missed = missing(rays, distance)
     depth = rays.depth[missed]
-    nodes = distance.shape[0]
     return splat(
         torch.stack([torch.ones_like(depth), depth], dim=-1), locate(rays.middle[missed], nodes), nodes
     )

@@ -1,6 +1,6 @@
 """All that photographs and stereo say, as tensors in one frame: what the field is fitted to."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -42,37 +42,49 @@ class Measurements:
 
 
 def measurements(
-    views: tuple[View, ...], region: Region, frame: Region, stereo: StereoResult, device: torch.device
+    views: tuple[View, ...], region: Region, stereo: StereoResult, device: torch.device
 ) -> Measurements:
-    """Everything measured, carried from the region's object frame to another frame."""
+    """Everything measured, in the region's object frame."""
     points = stereo.points
-    frame_from_object = frame.object_from_world @ region.world_from_object
-    scale = region.radius_world / frame.radius_world
-    middle = torch.tensor(frame_from_object[:3, 3], dtype=torch.float32, device=device)
-    images = [torch.tensor(view.image_srgb, device=device).permute(2, 0, 1) for view in views]
     outlines = [_outline_or_none(view.mask, device) for view in views]
     empty = [None if m.empty is None else ~m.empty for m in stereo.depth_maps]
     subject = [_outline_or_none(m.subject, device) for m in stereo.depth_maps]
     return Measurements(
-        cameras=[pinhole_in_object(view.camera, frame, device) for view in views],
-        images=images,
+        cameras=[pinhole_in_object(view.camera, region, device) for view in views],
+        images=[torch.tensor(view.image_srgb, device=device).permute(2, 0, 1) for view in views],
         backdrops=[_outline_or_none(known, device) for known in empty],
         certain=[on if o is None else o for o, on in zip(outlines, subject, strict=True)],
         masks=[None if v.mask is None else torch.tensor(v.mask, device=device) for v in views],
         outlines=outlines,
-        depths=[_sure_depth(map_, scale, device) for map_ in stereo.depth_maps],
-        positions=torch.tensor(points.positions, device=device) * scale + middle,
+        depths=[_sure_depth(map_, device) for map_ in stereo.depth_maps],
+        positions=torch.tensor(points.positions, device=device),
         normals=torch.tensor(points.normals, device=device),
         colours=torch.tensor(points.colours_srgb, device=device),
         confidence=torch.tensor(points.confidence, device=device),
+        region_centre=torch.zeros(3, device=device),
+        region_radius=1.0,
+    )
+
+
+def carried(scene: Measurements, views: tuple[View, ...], region: Region, frame: Region) -> Measurements:
+    """The measurements of the views in the region's object frame, in another frame."""
+    device = scene.positions.device
+    frame_from_object = frame.object_from_world @ region.world_from_object
+    scale = region.radius_world / frame.radius_world
+    middle = torch.tensor(frame_from_object[:3, 3], dtype=torch.float32, device=device)
+    return replace(
+        scene,
+        cameras=[pinhole_in_object(view.camera, frame, device) for view in views],
+        depths=[depth * scale for depth in scene.depths],
+        positions=scene.positions * scale + middle,
         region_centre=middle,
         region_radius=scale,
     )
 
 
-def _sure_depth(map_: DepthMap, scale: float, device: torch.device) -> Float[Tensor, "height width"]:
+def _sure_depth(map_: DepthMap, device: torch.device) -> Float[Tensor, "height width"]:
     """Depths sure enough to call what lies before them empty; 0 elsewhere."""
-    return torch.tensor(np.where(map_.confidence > SURE, map_.depth * scale, 0), device=device)
+    return torch.tensor(np.where(map_.confidence > SURE, map_.depth, 0), device=device)
 
 
 def _outline_or_none(

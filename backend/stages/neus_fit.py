@@ -98,7 +98,7 @@ def fit_neus(
     """
     deadline = deadline_after(config.budget_s, clock)
     progress(0.0, "making networks")
-    scene = measurements(views, region, region, stereo, device)
+    scene = measurements(views, region, stereo, device)
     model = _Model(config.network, generator).to(device)
     look = partial(surface_in, region=region, frame=region, nodes=COARSEST, device=device)
     began_s = clock()

@@ -71,7 +71,7 @@ def fit_radiance(
     led to numbers that are not finite again and again.
     """
     deadline = deadline_after(config.budget_s, clock)
-    scene = measurements(views, region, region, stereo, device)
+    scene = measurements(views, region, stereo, device)
     pixels = pixels_of_unit_sphere(scene)
     field = RadianceField(config.shape, generator).to(device)
     backdrop = _Backdrop(pixels).to(device)

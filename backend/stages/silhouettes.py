@@ -78,18 +78,34 @@ def silhouette_rays(scene: Measurements, bound: Float[Tensor, "nodes nodes nodes
     return SilhouetteRays(origins=origins, directions=directions, entry=entry, middle=middle, depth=depth)
 
 
+def inside_along(
+    rays: SilhouetteRays, distance: Float[Tensor, "nodes nodes nodes"], before: Float[Tensor, "rays"]
+) -> Float[Tensor, "rays"]:
+    """How far along each ray a field is inside, about where the ray enters it; infinite where it misses.
+
+    `before` is the same of an earlier field, or infinite: where this one is inside there too, nothing is
+    searched. A field changes little from round to round, so hardly a ray has to be traced again.
+    """
+    shortest = 0.5 * spacing(distance.shape[0])
+
+    def value(points: Float[Tensor, "points 3"]) -> Float[Tensor, "points"]:
+        return read(distance, points)
+
+    known = before.isfinite()
+    at = torch.where(known, before, 0.0)[:, None]
+    known = known & (value(rays.origins + at * rays.directions) < 0)
+    lost = torch.nonzero(~known)[:, 0]
+    origins, directions, entry = rays.origins[lost], rays.directions[lost], rays.entry[lost]
+    crossing = first_crossing(
+        value, origins, directions, entry, reach=2 * _AROUND, shortest=shortest, steps=60
+    )
+    found = torch.where(crossing.hit, crossing.along + 0.5 * shortest, torch.inf)
+    return before.index_copy(0, lost, found)
+
+
 def missing(rays: SilhouetteRays, distance: Float[Tensor, "nodes nodes nodes"]) -> Bool[Tensor, "rays"]:
     """Rays that miss a field's inside."""
-    crossing = first_crossing(
-        lambda points: read(distance, points),
-        rays.origins,
-        rays.directions,
-        rays.entry,
-        reach=2 * _AROUND,
-        shortest=0.5 * spacing(distance.shape[0]),
-        steps=60,
-    )
-    return ~crossing.hit
+    return inside_along(rays, distance, torch.full_like(rays.entry, torch.inf)).isinf()
 
 
 def _meets_region(

@@ -19,7 +19,7 @@ from ..maths.grid import refined, spacing
 from ..scene import Decision, Progress, Region, View, to_unit_sphere, within
 from .deadline import Clock, GridCost, deadline_after, finest_grid, predicted_s
 from .linear_fit import LinearConfig, fit_level, start
-from .measurements import Measurements, measurements
+from .measurements import Measurements, carried, measurements
 from .radiance_field import Radiance
 from .render_fit import RenderConfig, refine
 from .stereo import StereoResult
@@ -87,13 +87,13 @@ def fit_surface(
     deadline = deadline_after(config.budget_s, clock)
     progress(0.0, "finding the extent of the surface")
     with torch.no_grad():
-        scene = measurements(views, region, region, stereo, device)
+        scene = measurements(views, region, stereo, device)
         radius, depth = depth_behind(scene, config.linear)
         began_s = clock()
         distance = fit_level(scene, start(scene, radius, COARSEST), radius, config.rounds[0], config.linear)
         frame = tight_frame(distance, region)
         costs = [GridCost(nodes=COARSEST, seconds=clock() - began_s)]
-        scene = measurements(views, region, frame, stereo, device)
+        scene = carried(scene, views, region, frame)
         distance = start(scene, radius, config.levels[0])
     total = sum(config.steps) + 10 * len(config.levels)
     done, rendered, taken_back = 0, 0, 0

@@ -14,7 +14,7 @@ from torch import Tensor
 from backend.errors import ErrorCode, ReconstructionError
 from backend.scene import Decision, Region, View, no_progress
 from backend.stages.deadline import deadline_after
-from backend.stages.measurements import measurements
+from backend.stages.measurements import carried, measurements
 from backend.stages.neus_fit import NeusConfig, fit_neus
 from backend.stages.radiance_fit import RadianceConfig, fit_radiance
 from backend.stages.render_fit import Refined, RenderConfig, refine
@@ -56,7 +56,7 @@ def linear() -> Surface:
 
 def rendered(views: tuple[View, ...], steps: int, seed: int = 0) -> Refined:
     frame = Region(object_from_world=linear().grid_from_world)
-    measured = measurements(views, true_region(), frame, stereo(), CPU)
+    measured = carried(measurements(views, true_region(), stereo(), CPU), views, true_region(), frame)
     chance = torch.Generator().manual_seed(seed)
     never = deadline_after(None, time.perf_counter)
     return refine(measured, torch.from_numpy(linear().distance), steps, FEW, chance, no_progress, never)

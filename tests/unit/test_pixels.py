@@ -13,7 +13,7 @@ from tests.synthetic_scene import Scene, photographed, ring_cameras, true_region
 def measured(scene: Scene) -> Measurements:
     """The views in the region's frame, without points."""
     region = true_region()
-    return measurements(scene.views, region, region, unmatched(scene.views), torch.device("cpu"))
+    return measurements(scene.views, region, unmatched(scene.views), torch.device("cpu"))
 
 
 def test_rays_of_the_unit_sphere_go_through_it_and_through_their_pixels() -> None:

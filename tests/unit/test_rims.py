@@ -180,7 +180,7 @@ def test_rims_of_masks_lie_on_the_body_but_for_a_pixel() -> None:
     """Of whole pixels, whose steps turn the normals."""
     scene = photographed(ring_cameras(3, WIDTH))
     region = true_region()
-    of_masks = measurements(scene.views, region, region, unmatched(scene.views), CPU)
+    of_masks = measurements(scene.views, region, unmatched(scene.views), CPU)
     nodes_world = transform_points(region.world_from_object, node_positions(64, CPU).double().numpy())
     distance = torch.tensor(surface_distance(nodes_world.reshape(-1, 3))) / region.radius_world
     positions, normals = touched(of_masks, distance.reshape(64, 64, 64).float())

@@ -11,12 +11,12 @@ from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 
 from backend.maths.geometry import Pinhole, pixel_centres, ray_directions
-from backend.maths.grid import node_positions, spacing
+from backend.maths.grid import node_positions, read, spacing
 from backend.maths.rays import first_crossing
 from backend.stages import unseen_depth
 from backend.stages.linear_fit import LinearConfig
 from backend.stages.measurements import Measurements
-from backend.stages.silhouettes import least_distance, missing, silhouette_rays
+from backend.stages.silhouettes import inside_along, least_distance, missing, silhouette_rays
 from backend.stages.unseen_depth import depth_behind
 from backend.stages.unseen_side import DEEPEST, ball_behind, explained_radius
 
@@ -113,6 +113,19 @@ def test_the_middle_of_a_ray_lies_where_no_silhouette_forbids_it() -> None:
         assert (edge[row, column] < 2.5).all(), "a cell is about three pixels"
     assert (rays.depth > 0).all()
     assert (rays.depth <= spacing(NODES)).all()
+
+
+@pytest.mark.parametrize("thinner", [0.0, 0.1, 0.3], ids=["the same", "thinner", "gone"])
+def test_what_an_earlier_field_knew_changes_nothing(thinner: float) -> None:
+    scene = seen([-20.0, 0.0, 20.0], -0.5)
+    rays = silhouette_rays(scene, least_distance(scene, NODES))
+    field = capsule(node_positions(NODES, CPU), -0.5)
+    before = inside_along(rays, field, torch.full_like(rays.entry, torch.inf))
+    along = inside_along(rays, field + thinner, before)
+    assert (along.isinf() == missing(rays, field + thinner)).float().mean() > 0.995, "but those that graze"
+    met = along.isfinite()
+    value = read(field + thinner, rays.origins[met] + along[met, None] * rays.directions[met])
+    assert (value < 0.5 * spacing(NODES)).all()
 
 
 def test_a_ray_that_another_photograph_contradicts_is_left_out() -> None:
