@@ -19,6 +19,15 @@ class Crossing:
     hit: Bool[Tensor, "rays"]
 
 
+def points_along(
+    origins: Float[Tensor, "rays 3"],
+    directions: Float[Tensor, "rays 3"],
+    along: Float[Tensor, "rays samples"],
+) -> Float[Tensor, "rays samples 3"]:
+    """o + t d for every ray at each of its own t."""
+    return origins[:, None] + along[..., None] * directions[:, None]
+
+
 def sphere_entry(
     origins: Float[Tensor, "rays 3"], directions: Float[Tensor, "rays 3"]
 ) -> Float[Tensor, "rays"]:

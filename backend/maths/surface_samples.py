@@ -4,7 +4,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from .rays import DistanceFunction
+from .rays import DistanceFunction, points_along
 from .resampling import resample, strata
 from .volume import blending_weights, log_transmittance
 
@@ -32,7 +32,7 @@ def surface_samples(
     """
 
     def at(along: Float[Tensor, "rays samples"]) -> Float[Tensor, "rays samples"]:
-        points = origins[:, None] + along[..., None] * directions[:, None]
+        points = points_along(origins, directions, along)
         return distance(points.reshape(-1, 3)).reshape(along.shape)
 
     with torch.no_grad():

@@ -12,7 +12,7 @@ from ..maths import losses
 from ..maths.gradients import analytic_gradient, central_gradient
 from ..maths.nearest import nearest_tree
 from ..maths.radiance import composite
-from ..maths.rays import sphere_span
+from ..maths.rays import points_along, sphere_span
 from ..maths.surface_samples import surface_samples
 from ..maths.volume import annealed_slope, log_transmittance_of_middles, log_transparency
 from .measurements import Measurements
@@ -129,7 +129,7 @@ def ray_loss(
         generator=generator,
     )
     along = (edges[:, 1:] + edges[:, :-1]) / 2
-    points = (origins[:, None] + along[..., None] * directions[:, None]).reshape(-1, 3)
+    points = points_along(origins, directions, along).reshape(-1, 3)
     towards = directions[:, None].expand(*along.shape, 3).reshape(-1, 3)
     distance, gradient, features = _at(surface, points, moment)
     slope = annealed_slope((gradient * towards).sum(dim=-1).reshape(along.shape), moment.annealed)

@@ -16,7 +16,7 @@ from torch import Tensor, nn
 
 from ..maths.encoding import positional_encoding, wave_window
 from ..maths.radiance import log_pass_of_density
-from ..maths.rays import sphere_span
+from ..maths.rays import points_along, sphere_span
 from ..maths.resampling import resample, strata
 from ..maths.volume import blending_weights
 from ..scene import Region
@@ -171,7 +171,7 @@ def _middles(
     origins: Float[Tensor, "rays 3"], directions: Float[Tensor, "rays 3"], edges: Float[Tensor, "rays edges"]
 ) -> Float[Tensor, "points 3"]:
     along = (edges[:, 1:] + edges[:, :-1]) / 2
-    return (origins[:, None] + along[..., None] * directions[:, None]).reshape(-1, 3)
+    return points_along(origins, directions, along).reshape(-1, 3)
 
 
 def _density(x: Float[Tensor, "points"]) -> Float[Tensor, "points"]:

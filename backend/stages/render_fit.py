@@ -13,7 +13,7 @@ from torch import Tensor
 
 from ..maths import losses
 from ..maths.grid import laplacian_at, read, spacing, splat
-from ..maths.rays import first_crossing, sphere_entry
+from ..maths.rays import first_crossing, points_along, sphere_entry
 from ..maths.volume import blending_weights, log_transmittance, log_transparency
 from ..scene import Progress
 from .deadline import Deadline
@@ -121,7 +121,7 @@ def _ray_loss(
     spread = torch.linspace(-3, 3, config.edges, device=origins.device)
     jitter = torch.rand((config.rays, 1), generator=generator).to(origins.device) - 0.5
     along = crossing.along[:, None] + h * (spread + jitter * (spread[1] - spread[0]))
-    points = origins[:, None] + along[..., None] * directions[:, None]
+    points = points_along(origins, directions, along)
     distances = field.distance(field.locate(points.reshape(-1, 3))).reshape(along.shape)
     log_pass = log_transmittance(distances, sharpness)
     weights = blending_weights(log_pass)

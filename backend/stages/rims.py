@@ -16,6 +16,7 @@ from torch import Tensor
 from ..maths.evidence import half_cell_px
 from ..maths.geometry import ray_directions
 from ..maths.grid import read, spacing
+from ..maths.rays import points_along
 from .measurements import Measurements
 
 _FARTHEST_CELLS = 6.0
@@ -59,7 +60,7 @@ def rim_points(
     count = math.ceil(2 * reach / h) + 1
     steps = torch.linspace(-reach, reach, count, device=distance.device)
     along = (rays.origins.norm(dim=-1, keepdim=True) + steps).clamp(min=0)
-    points = rays.origins[:, None] + along[..., None] * rays.directions[:, None]
+    points = points_along(rays.origins, rays.directions, along)
     values = read(distance, points.reshape(-1, 3)).reshape(along.shape)
     values = torch.where(points.abs().amax(dim=-1) < 1, values, math.inf)
     lowest, index = values.min(dim=1)

@@ -10,7 +10,7 @@ from torch import Tensor
 from ..maths.evidence import half_cell_px, off_silhouette
 from ..maths.geometry import Pinhole, ray_directions
 from ..maths.grid import node_positions, read, spacing
-from ..maths.rays import first_crossing, sphere_entry
+from ..maths.rays import first_crossing, points_along, sphere_entry
 from .measurements import Measurements
 
 _AROUND = 1.75
@@ -65,7 +65,7 @@ def silhouette_rays(scene: Measurements, bound: Float[Tensor, "nodes nodes nodes
         origins = camera.position.expand_as(directions)
         entry = sphere_entry(origins / _AROUND, directions) * _AROUND
         along = entry[:, None] + torch.linspace(0, 2 * _AROUND, 2 * nodes, device=entry.device)
-        points = origins[:, None] + along[..., None] * directions[:, None]
+        points = points_along(origins, directions, along)
         allowed = (read(bound, points.reshape(-1, 3)) < 0).reshape(along.shape).cumsum(dim=1)
         middle = torch.searchsorted(allowed, (allowed[:, -1:] + 1) // 2)
         chosen = allowed[:, -1] > 0
