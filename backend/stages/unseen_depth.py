@@ -6,7 +6,7 @@ from ..scene import Decision
 from .linear_fit import LinearConfig, fit_level, start
 from .measurements import Measurements
 from .silhouettes import least_distance, missing, silhouette_rays
-from .unseen_side import DEEPEST, depth_is_bounded, explained_radius, widest_view_angle_deg
+from .unseen_side import DEEPEST, depth_is_bounded, explained_radius, is_all_around, widest_view_angle_deg
 
 _NODES = 48
 _ROUNDS = 6
@@ -28,7 +28,7 @@ def depth_behind(scene: Measurements, config: LinearConfig) -> tuple[float, Deci
     because = f"the photographs are taken from sides up to {angle_deg:.0f} degrees apart"
     if radius > explained:
         because += f"; with the {explained:.2f} that measured points ask for, silhouettes were missed"
-    elif angle_deg <= 90:
+    elif not is_all_around(scene):
         because += "; so turn the normals of the measured points"
     choice = f"a ball of {radius:.2f} half widths of the subject behind what was measured"
     return radius, Decision(what="depth of the unseen side", choice=choice, because=because)

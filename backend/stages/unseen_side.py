@@ -30,9 +30,9 @@ def ball_behind(scene: Measurements, radius: float, nodes: int) -> Float[Tensor,
 def explained_radius(scene: Measurements) -> float:
     """All that measured points say of the ball's radius, in half widths of the subject; at most 1.
 
-    Least squares of p = c + r n over points and normals: for points all around it is the object's size,
-    for points on one side what the turning of their normals says. Where the photographs are taken from
-    sides far enough apart for silhouettes to bound the depth, it is as large as the subject is wide.
+    Least squares of p = c + r n over points and normals: for points on one side what the turning of their
+    normals says. Where photographs are taken from all around, no side is left to be assumed, and the
+    flattest ball disturbs least.
     """
     mean_p, mean_n = _mean(scene, scene.positions), _mean(scene, scene.normals)
     turned = scene.normals - mean_n
@@ -40,7 +40,7 @@ def explained_radius(scene: Measurements) -> float:
     together = _mean(scene, (scene.positions - mean_p) * turned).sum()
     turning = float(together / spread.clamp(min=1e-6)) / _half_width(scene, mean_p)
     explained = min(max(turning, LEAST_RADIUS), 1.0)
-    return explained + depth_is_bounded(scene) * (1 - explained)
+    return explained + is_all_around(scene) * (1 - explained)
 
 
 def _mean(scene: Measurements, values: Float[Tensor, "points 3"]) -> Float[Tensor, "3"]:
@@ -57,6 +57,11 @@ def widest_view_angle_deg(scene: Measurements) -> float:
 def depth_is_bounded(scene: Measurements) -> float:
     """Whether silhouettes bound the depth: 0 if the photographs are taken from one side, 1 if from many."""
     return min(max((widest_view_angle_deg(scene) - 50) / 40, 0.0), 1.0)
+
+
+def is_all_around(scene: Measurements) -> float:
+    """Whether no side is unseen: 0 if photographs are taken from within 125 degrees, 1 from 160 on."""
+    return min(max((widest_view_angle_deg(scene) - 125) / 35, 0.0), 1.0)
 
 
 def _half_width(scene: Measurements, at: Float[Tensor, "3"]) -> float:
