@@ -12,6 +12,8 @@ from .measurements import Measurements
 
 LEAST_RADIUS = 0.3
 """Of the ball, in half widths of the subject."""
+LEAST_BOUNDED_RADIUS = 0.5
+"""The same where silhouettes bound the depth: they cut a ball that is too deep, one too small stays."""
 DEEPEST = 1.4
 """The same, at most: as deep as the subject is across its diagonal."""
 
@@ -39,7 +41,8 @@ def explained_radius(scene: Measurements) -> float:
     spread = _mean(scene, turned.square()).sum()
     together = _mean(scene, (scene.positions - mean_p) * turned).sum()
     turning = float(together / spread.clamp(min=1e-6)) / _half_width(scene, mean_p)
-    explained = min(max(turning, LEAST_RADIUS), 1.0)
+    least = LEAST_RADIUS + depth_is_bounded(scene) * (LEAST_BOUNDED_RADIUS - LEAST_RADIUS)
+    explained = min(max(turning, least), 1.0)
     return explained + is_all_around(scene) * (1 - explained)
 
 
