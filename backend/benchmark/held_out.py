@@ -4,7 +4,6 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from tempfile import TemporaryDirectory
 
 import numpy as np
 import torch
@@ -13,11 +12,12 @@ from jaxtyping import Bool, Float32
 from ..maths.metrics import psnr
 from ..maths.raycast import RayCaster, render_mesh
 from ..scene import Camera, SurfaceMesh, View, no_progress
-from ..stages.cameras import CamerasConfig, solve_cameras
-from ..stages.photos import PhotosConfig, load_photos
+from ..stages.cameras import CamerasConfig
+from ..stages.photos import PhotosConfig
 from ..stages.radiance_field import Radiance, restored
 from ..stages.radiance_image import radiance_image
-from .suites import Case, image_paths
+from .one_by_one import solve
+from .suites import Case
 
 _Drawn = tuple[Float32[np.ndarray, "height width 3"], Bool[np.ndarray, "height width"]]
 """Colours, 0 or the background's where nothing is, and what is covered."""
@@ -40,18 +40,7 @@ class HeldOutFit:
 def known_views(case: Case, folder: Path, indices: tuple[int, ...]) -> tuple[View, ...]:
     """Photographs of a case with their known cameras, undistorted. Raises ReconstructionError."""
     assert case.cameras is not None
-    masks = None if case.masks is None else folder / case.masks
-    paths = image_paths(case, folder, indices)
-    photos = load_photos(paths, masks, PhotosConfig(max_side_px=MAX_SIDE_PX), progress=no_progress)
-    with TemporaryDirectory() as scratch:
-        return solve_cameras(
-            photos,
-            folder / case.cameras,
-            CamerasConfig(),
-            workdir=Path(scratch),
-            seed=0,
-            progress=no_progress,
-        ).views
+    return solve(case, folder, indices, PhotosConfig(max_side_px=MAX_SIDE_PX), CamerasConfig()).views
 
 
 def held_out_fit(mesh: SurfaceMesh, views: Sequence[View]) -> HeldOutFit:

@@ -149,10 +149,10 @@ def measure(
     numbers = {**report_numbers(report), "wall_s": wall_s}
     failure = None
     try:
-        if trial.case.held_out:
-            numbers |= _held_out_numbers(trial, output)
         if trial.case.surroundings is not None:
             numbers |= _errors_of_subject(trial, output)
+        if trial.case.held_out:
+            numbers |= _held_out_numbers(trial, output)
     except ReconstructionError as error:
         failure = str(error)
     return done(numbers=numbers, versions=report["versions"], failure=failure)

@@ -11,10 +11,10 @@ from typing import TypeVar
 import torch
 
 from ..presets import Settings
-from ..scene import Region, SurfaceMesh, View, no_progress
-from ..stages.cameras import solve_cameras
+from ..scene import Region, SolvedCameras, SurfaceMesh, View, no_progress
+from ..stages.cameras import CamerasConfig, solve_cameras
 from ..stages.mesh import extract_mesh
-from ..stages.photos import load_photos
+from ..stages.photos import PhotosConfig, load_photos
 from ..stages.region import find_region
 from ..stages.stereo import StereoResult, match_views
 from ..stages.stereo_config import StereoConfig
@@ -36,16 +36,20 @@ class Placed:
         return replace(self, views=tuple(replace(view, mask=None) for view in self.views))
 
 
+def solve(
+    case: Case, folder: Path, indices: tuple[int, ...], photos: PhotosConfig, cameras: CamerasConfig
+) -> SolvedCameras:
+    """The case's images with these numbers, undistorted. Raises ReconstructionError."""
+    masks = None if case.masks is None else folder / case.masks
+    known = None if case.cameras is None else folder / case.cameras
+    loaded = load_photos(image_paths(case, folder, indices), masks, photos, progress=no_progress)
+    with TemporaryDirectory() as scratch:
+        return solve_cameras(loaded, known, cameras, workdir=Path(scratch), seed=0, progress=no_progress)
+
+
 def place(case: Case, folder: Path, indices: tuple[int, ...], settings: Settings) -> Placed:
     """The case's images with these numbers, undistorted, and the region. Raises ReconstructionError."""
-    masks = None if case.masks is None else folder / case.masks
-    cameras = None if case.cameras is None else folder / case.cameras
-    paths = image_paths(case, folder, indices)
-    photos = load_photos(paths, masks, settings.photos, progress=no_progress)
-    with TemporaryDirectory() as scratch:
-        solved = solve_cameras(
-            photos, cameras, settings.cameras, workdir=Path(scratch), seed=0, progress=no_progress
-        )
+    solved = solve(case, folder, indices, settings.photos, settings.cameras)
     region = find_region(solved, settings.region, progress=no_progress)
     return Placed(views=solved.views, region=region)
 

@@ -59,12 +59,21 @@ def widest_view_angle_deg(scene: Measurements) -> float:
 
 def depth_is_bounded(scene: Measurements) -> float:
     """Whether silhouettes bound the depth: 0 if the photographs are taken from one side, 1 if from many."""
-    return min(max((widest_view_angle_deg(scene) - 50) / 40, 0.0), 1.0)
+    return _ramp(widest_view_angle_deg(scene), 50.0, 90.0)
 
 
 def is_all_around(scene: Measurements) -> float:
-    """Whether no side is unseen: 0 if photographs are taken from within 125 degrees, 1 from 160 on."""
-    return min(max((widest_view_angle_deg(scene) - 125) / 35, 0.0), 1.0)
+    """Whether no side is unseen: 0 if photographs are taken from within 125 degrees, 1 from 160 on.
+
+    The direction farthest from all cameras is 180 - a / 2 degrees from the nearest one, where a is the widest
+    angle: behind the subject for an arc of a, beneath it for a ring that looks down by 90 - a / 2.
+    """
+    return _ramp(widest_view_angle_deg(scene), 125.0, 160.0)
+
+
+def _ramp(value: float, none: float, full: float) -> float:
+    """0 up to one value, 1 from another on."""
+    return min(max((value - none) / (full - none), 0.0), 1.0)
 
 
 def _half_width(scene: Measurements, at: Float[Tensor, "3"]) -> float:

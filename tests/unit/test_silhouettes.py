@@ -34,10 +34,10 @@ def capsule(points: Float[Tensor, "*batch 3"], back: float) -> Float[Tensor, "*b
     return distance
 
 
-def camera_from(azimuth_deg: float) -> Pinhole:
+def camera_from(azimuth_deg: float, *, height: float = 0.3) -> Pinhole:
     """Four units before the capsule's front, a little above."""
     azimuth = math.radians(azimuth_deg)
-    position = 4 * F.normalize(torch.tensor([math.cos(azimuth), math.sin(azimuth), 0.3]), dim=0)
+    position = 4 * F.normalize(torch.tensor([math.cos(azimuth), math.sin(azimuth), height]), dim=0)
     forward = -F.normalize(position, dim=0)
     right = F.normalize(torch.linalg.cross(forward, torch.tensor([0.0, 0.0, 1.0])), dim=0)
     camera_from_object = torch.eye(4)
@@ -171,6 +171,18 @@ def test_the_ball_behind_grows_with_what_only_silhouettes_show(measured_from: fl
     assert 1.5 * short < long <= DEEPEST
     assert "silhouettes were missed" not in why_short.because
     assert "silhouettes were missed" in why_long.because
+
+
+def test_half_around_the_points_tell_the_radius_and_all_around_it_is_the_widest() -> None:
+    """Of a capsule seen from its end, which is a quarter of a unit wide and bends within that."""
+    half = explained_radius(seen([-60.0, -20.0, 20.0, 60.0], -0.5))
+    assert half < 0.8
+    assert half == pytest.approx(explained_radius(seen([-50.0, 0.0, 50.0], -0.5)), rel=0.05)
+    azimuths = [60.0 * i for i in range(6)]
+    ring = seen(azimuths, -0.5)
+    assert half < explained_radius(ring) < 1.0, "from 17 degrees above: what is beneath is not seen"
+    ring.cameras[:] = [camera_from(azimuth, height=0.0) for azimuth in azimuths]
+    assert explained_radius(ring) == 1.0
 
 
 def test_without_silhouettes_nothing_is_tried(monkeypatch: pytest.MonkeyPatch) -> None:
