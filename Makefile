@@ -31,8 +31,9 @@ $(DEMO)/scene/transforms.json: .venv-blender/.ready $(wildcard blender_scenes/*.
 # Blender's Python has no jaxtyping: its tests run without the shape checks of pyproject.toml.
 BLENDER_TESTS := -o addopts="--strict-markers --import-mode=importlib" tests/blender
 
+# Two at a time: most tests use one core.
 test: .venv/.ready .venv-blender/.ready
-	$(BACKEND) -m pytest --ignore=tests/blender
+	$(BACKEND) -m pytest --ignore=tests/blender --numprocesses 2 --dist worksteal
 	FEWVIEW_PYTHON=$(abspath $(BACKEND)) $(BPY) -m pytest $(BLENDER_TESTS)
 
 # A Blender with settings of its own: the tests install the extension, and must not touch the user's.

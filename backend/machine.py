@@ -38,7 +38,9 @@ def set_up_torch(device: torch.device) -> None:
     torch.set_num_threads(min(torch.get_num_threads(), usable_cores()))
     if device.type == "cpu":
         torch.set_flush_denormal(True)  # weights near 0 are many and slow the CPU down tenfold
-        torch.use_deterministic_algorithms(True)
+        # What use_deterministic_algorithms does for code that is not compiled; that one loads the compiler,
+        # which takes as long as all of torch.
+        torch.set_deterministic_debug_mode("error")
         # Filling memory before it is written costs time and changes nothing.
         torch.utils.deterministic.fill_uninitialized_memory = False  # type: ignore[attr-defined]
 
