@@ -26,6 +26,7 @@ from ..maths.inverse_depth import (
     lowest_with_neighbours,
     piece_sizes,
 )
+from ..maths.median import median_3x3
 from ..maths.semi_global import aggregate
 from ..scene import Progress, within
 from .stereo_config import StereoConfig
@@ -254,7 +255,7 @@ def _refined(current: Map, sources: list[Window], steps_px: list[float], config:
         hypotheses = (middle + offsets * step).clamp(far, near)
         score = _scores(window, sources, hypotheses, config)
         best = score.max(dim=0).values
-        index, offset = lowest_with_neighbours(1 - score.permute(1, 2, 0))
+        index, offset = lowest_with_neighbours((1 - score).permute(1, 2, 0).contiguous())
         current = Map(
             window=window,
             inverse_depth=(middle + (index - 2 + offset) * step).clamp(far, near),
@@ -277,21 +278,13 @@ def _sharpness(
 
 def _smoothed(current: Map, radius: int) -> Float[Tensor, "height width"]:
     """Planes fitted to the better half of every neighbourhood; holes are filled from around."""
-    median = _median(current.inverse_depth)
+    median = median_3x3(current.inverse_depth)
     weight = current.score.clamp(min=0.01) ** 2 * current.window.subject
     spread = window_mean((current.inverse_depth - median).abs(), current.window.subject.float(), radius)
     spread = spread.clamp(min=torch.finfo(spread.dtype).tiny)
     weight = weight * torch.exp(-(((current.inverse_depth - median) / (2 * spread)) ** 2))
     value = fit_planes(median, weight, radius)[0]
     return torch.where(window_sum(weight, radius) > 1e-3, value, median)
-
-
-def _median(values: Float[Tensor, "height width"]) -> Float[Tensor, "height width"]:
-    """Median over 3x3."""
-    padded = F.pad(values[None, None], (1, 1, 1, 1), mode="replicate")[0, 0]
-    height, width = values.shape
-    shifted = [padded[r : r + height, c : c + width] for r in range(3) for c in range(3)]
-    return torch.stack(shifted).median(dim=0).values
 
 
 def _enlarged(current: Map, window: Window) -> Map:
