@@ -11,7 +11,7 @@ import time
 import typing
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from functools import partial
+from functools import cache, partial
 from importlib.metadata import version
 from itertools import takewhile
 from pathlib import Path
@@ -293,6 +293,7 @@ def stage_fingerprints(job: Job, settings: Settings, device_kind: str) -> dict[s
     return found
 
 
+@cache
 def code_fingerprint() -> str:
     """Changes with the code that computes results, so that no result of older code is taken for new."""
     here = Path(__file__).parent

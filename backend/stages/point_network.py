@@ -68,7 +68,7 @@ class Queries:
     """Standard deviation of the noise that made the query from a point."""
 
 
-class DistanceNetwork(nn.Module):
+class PointNetwork(nn.Module):
     """A multilayer perceptron that begins as the signed distance of a ball (Atzmon and Lipman, SAL, 2020)."""
 
     def __init__(self, width: int, layers: int, generator: torch.Generator) -> None:
@@ -109,7 +109,7 @@ def fit_network(
     step_loss = METHODS[method]
     num_queries = config.batch // {"nap": 2, "sdro": 1 + config.draws}.get(method, 1)
     queries = _draw_queries(points, config.anywhere, generator)
-    network = DistanceNetwork(config.width, config.layers, generator).to(points.device)
+    network = PointNetwork(config.width, config.layers, generator).to(points.device)
     balance = nn.Parameter(torch.ones(2, device=points.device))  # NAP's own weights
     optimiser = torch.optim.Adam([*network.parameters(), balance], lr=config.learning_rate)
     schedule = torch.optim.lr_scheduler.LambdaLR(optimiser, lambda step: _rate(step, config))
@@ -163,7 +163,7 @@ def _rate(step: int, config: NetworkConfig) -> float:
 
 
 def _value_and_gradient(
-    network: DistanceNetwork, positions: Float[Tensor, "*batch 3"]
+    network: PointNetwork, positions: Float[Tensor, "*batch 3"]
 ) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch 3"]]:
     """Both differentiable in the network and in the positions, which must ask for gradients."""
     values = network(positions)
@@ -172,14 +172,14 @@ def _value_and_gradient(
 
 
 def _pull_losses(
-    network: DistanceNetwork, positions: Float[Tensor, "*batch 3"], nearest: Float[Tensor, "*#batch 3"]
+    network: PointNetwork, positions: Float[Tensor, "*batch 3"], nearest: Float[Tensor, "*#batch 3"]
 ) -> Float[Tensor, "*batch"]:
     values, gradient = _value_and_gradient(network, positions)
     return pull(values, gradient, nearest - positions)
 
 
 def _neural_pull(
-    network: DistanceNetwork,
+    network: PointNetwork,
     batch: Queries,
     _balance: Tensor,
     _done: float,
@@ -191,7 +191,7 @@ def _neural_pull(
 
 
 def _nap(
-    network: DistanceNetwork,
+    network: PointNetwork,
     batch: Queries,
     balance: Tensor,
     _done: float,
@@ -209,7 +209,7 @@ def _nap(
 
 
 def _sdro(
-    network: DistanceNetwork,
+    network: PointNetwork,
     batch: Queries,
     _balance: Tensor,
     _done: float,
@@ -228,7 +228,7 @@ def _sdro(
 
 
 def _entropy(
-    network: DistanceNetwork,
+    network: PointNetwork,
     batch: Queries,
     _balance: Tensor,
     done: float,
@@ -247,7 +247,7 @@ def _entropy(
 
 
 _StepLoss = Callable[
-    [DistanceNetwork, Queries, Tensor, float, NetworkConfig, torch.Generator], Float[Tensor, ""]
+    [PointNetwork, Queries, Tensor, float, NetworkConfig, torch.Generator], Float[Tensor, ""]
 ]
 METHODS: dict[str, _StepLoss] = {
     "neural-pull": _neural_pull,

@@ -73,13 +73,13 @@ def fit_radiance(
     deadline = deadline_after(config.budget_s, clock)
     scene = measurements(views, region, stereo, device)
     pixels = pixels_of_unit_sphere(scene)
-    field = RadianceField(config.shape, generator).to(device)
+    radiance = RadianceField(config.shape, generator).to(device)
     backdrop = _Backdrop(pixels).to(device)
     optimiser = torch.optim.Adam(
-        [*field.parameters(), *backdrop.parameters()], lr=_FIRST_RATE, betas=(0.9, 0.99), eps=1e-12
+        [*radiance.parameters(), *backdrop.parameters()], lr=_FIRST_RATE, betas=(0.9, 0.99), eps=1e-12
     )
     began_s = clock()
-    field.density_and_features(torch.zeros((_POINTS_TIMED, 3), device=device))
+    radiance.density_and_features(torch.zeros((_POINTS_TIMED, 3), device=device))
     grid_s = PESSIMISM * (clock() - began_s) * (config.nodes**3 + COARSEST**3) / _POINTS_TIMED
     began_s = clock()
     steps_end = replace(deadline, at_s=deadline.at_s - min(grid_s, deadline.left_s() / 2))
@@ -89,8 +89,8 @@ def fit_radiance(
         if step % 10 == 0:
             progress(0.95 * done, f"fitting a radiance field, step {step} of {config.steps}")
             safe.keep()
-        field.open_waves(done / _ALL_WAVES_AT)
-        loss = _loss(field, backdrop, scene, pixels, config.rays, generator)
+        radiance.open_waves(done / _ALL_WAVES_AT)
+        loss = _loss(radiance, backdrop, scene, pixels, config.rays, generator)
         safe.take(loss, min(1.0, (step + 1) / _WARM_UP_STEPS) * (_LAST_RATE / _FIRST_RATE) ** done)
         if safe.hopeless:
             raise ReconstructionError(
@@ -100,15 +100,15 @@ def fit_radiance(
             )
         step += 1
         done = max(step / config.steps, steps_end.share_gone(began_s))
-    field.open_waves(1.0)
+    radiance.open_waves(1.0)
     progress(0.95, "density on a grid")
-    level = _level(field, scene, pixels)
-    surface = _level_surface(field, level, region, config.nodes, device)
+    level = _level(radiance, scene, pixels)
+    surface = _level_surface(radiance, level, region, config.nodes, device)
     show(surface)
     return Surface(
         distance=surface.distance,
         grid_from_world=surface.grid_from_world,
-        radiance=kept(field, region, backdrop.learned_srgb()),
+        radiance=kept(radiance, region, backdrop.learned_srgb()),
         decisions=_decisions(config, backdrop, step, safe.taken_back, level),
     )
 
@@ -130,7 +130,7 @@ class _Backdrop(nn.Module):
 
 
 def _loss(
-    field: RadianceField,
+    radiance: RadianceField,
     backdrop: _Backdrop,
     scene: Measurements,
     pixels: Pixels,
@@ -140,7 +140,7 @@ def _loss(
     """Mean squared difference of colours, and what the proposal leaves out."""
     device = pixels.view.device
     chosen = torch.randint(len(pixels.view), (rays,), generator=generator, device=generator.device).to(device)
-    samples = sample_rays(field, *rays_through(scene.cameras, pixels, chosen), generator)
+    samples = sample_rays(radiance, *rays_through(scene.cameras, pixels, chosen), generator)
     drawn = torch.rand((rays, 3), generator=generator, device=generator.device).to(device)
     coverage, colour = pixels.coverage[chosen, None], pixels.colour[chosen]
     masked = ~coverage.isnan()
@@ -164,7 +164,7 @@ def half_light_density(samples: RaySamples) -> Float[Tensor, "opaque"]:
     return (density / samples.edges[opaque].diff(dim=-1).gather(-1, interval))[:, 0]
 
 
-def _level(field: RadianceField, scene: Measurements, pixels: Pixels) -> float:
+def _level(radiance: RadianceField, scene: Measurements, pixels: Pixels) -> float:
     """Density that rays through the photographs meet, in the median, where half of their light is lost.
 
     Raises ReconstructionError(NO_SURFACE) where none loses as much.
@@ -172,7 +172,7 @@ def _level(field: RadianceField, scene: Measurements, pixels: Pixels) -> float:
     device = pixels.view.device
     chosen = torch.linspace(0, len(pixels.view) - 1, _RAYS_FOR_LEVEL, device=device).long()
     with torch.no_grad():
-        found = half_light_density(sample_rays(field, *rays_through(scene.cameras, pixels, chosen), None))
+        found = half_light_density(sample_rays(radiance, *rays_through(scene.cameras, pixels, chosen), None))
     if not len(found):
         raise ReconstructionError(
             ErrorCode.NO_SURFACE,
@@ -183,7 +183,7 @@ def _level(field: RadianceField, scene: Measurements, pixels: Pixels) -> float:
 
 
 def _level_surface(
-    field: RadianceField, level: float, region: Region, nodes: int, device: torch.device
+    radiance: RadianceField, level: float, region: Region, nodes: int, device: torch.device
 ) -> Surface:
     """The level of the density as the zero level of log(level / density), in cells of the region.
 
@@ -191,7 +191,7 @@ def _level_surface(
     """
 
     def pseudo_distance(points: Float[Tensor, "points 3"]) -> Float[Tensor, "points"]:
-        density, _ = field.density_and_features(points)
+        density, _ = radiance.density_and_features(points)
         return spacing(nodes) * (math.log(level) - density.clamp(min=_LEAST_DENSITY).log())
 
     return field_surface(pseudo_distance, region, nodes, device)
