@@ -144,11 +144,12 @@ def camera_rays(
     camera: Camera,
 ) -> tuple[Float64[np.ndarray, "pixels 3"], Float64[np.ndarray, "pixels 3"]]:
     """Origin and unit direction, world frame, through every pixel's centre, row by row."""
-    x = (np.arange(camera.width) + 0.5 - camera.cx_px) / camera.fx_px
-    y = (np.arange(camera.height) + 0.5 - camera.cy_px) / camera.fy_px
-    grid = np.stack([*np.meshgrid(x, y), np.ones((camera.height, camera.width))], -1).reshape(-1, 3)
-    directions = grid @ camera.camera_from_world[:3, :3]
-    directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
+    x = (np.arange(camera.width) + 0.5 - camera.cx_px)[:, None] / camera.fx_px
+    y = (np.arange(camera.height) + 0.5 - camera.cy_px)[:, None, None] / camera.fy_px
+    right, down, forward = camera.camera_from_world[:3, :3]
+    directions = x * right + (y * down + forward)
+    directions /= np.sqrt(1.0 + x * x + y * y)  # their length, because the three are orthonormal
+    directions = directions.reshape(-1, 3)
     return np.broadcast_to(camera.position, directions.shape), directions
 
 
