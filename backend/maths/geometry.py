@@ -119,6 +119,20 @@ def warp_pixels(
     return where
 
 
+def match_speed_px(
+    a: Float[Tensor, "3 3"],
+    b: Float[Tensor, "3"],
+    pixels: Float[Tensor, "height width 2"],
+    inverse_depth: Float[Tensor, "height width"],
+) -> Float[Tensor, "height width"]:
+    """Pixels by which what `warp_pixels` gives moves in the source, per unit of inverse depth."""
+    base = pixels @ a[:, :2].T + a[:, 2]
+    denominator = base[..., 2] + inverse_depth * b[2]
+    across = base[..., 2:] * b[:2] - base[..., :2] * b[2]
+    speed: Tensor = across.norm(dim=-1) / torch.where(denominator > 1e-6, denominator, 1e-9).square()
+    return speed
+
+
 def inside(pixels: Float[Tensor, "*batch 2"], width: int, height: int) -> Bool[Tensor, "*batch"]:
     """True where a pixel lies in the image."""
     x, y = pixels[..., 0], pixels[..., 1]

@@ -14,6 +14,7 @@ from ..maths.geometry import (
     Pinhole,
     epipolar_map,
     inside,
+    match_speed_px,
     pixel_centres,
     project,
     sample_image,
@@ -210,9 +211,7 @@ def _step_of_one_pixel(
     w = torch.as_tensor(inverse_depth, device=window.grey.device).expand(window.grey.shape)
     speed = torch.zeros_like(window.grey)
     for a, b in maps:
-        here = warp_pixels(a, b, pixels, w[None])[0]
-        there = warp_pixels(a, b, pixels, w[None] * 1.001)[0]
-        speed = torch.maximum(speed, (there - here).norm(dim=-1) / (0.001 * w))
+        speed = torch.maximum(speed, match_speed_px(a, b, pixels, w))
     return 1 / speed.clamp(min=1e-6)
 
 

@@ -10,6 +10,7 @@ from backend.maths.geometry import (
     Pinhole,
     epipolar_map,
     inside,
+    match_speed_px,
     pinhole_in_object,
     pixel_centres,
     project,
@@ -146,6 +147,15 @@ def test_warping_equals_unprojecting_and_projecting() -> None:
     expected, depth = project(RIGHT, unproject(LEFT, pixels.expand(2, -1, -1, -1), 1 / inverse_depth))
     assert (depth > 0).all()
     torch.testing.assert_close(warp_pixels(a, b, pixels, inverse_depth), expected)
+
+
+def test_the_speed_of_a_match_is_the_derivative_of_its_place() -> None:
+    pixels = pixel_centres(LEFT.width, LEFT.height, CPU).double()
+    inverse_depth, step = 1 / (2.0 + pixels[..., 0] / 20), 1e-6
+    a, b = epipolar_map(RIGHT, LEFT)
+    before, after = warp_pixels(a, b, pixels, torch.stack([inverse_depth - step, inverse_depth + step]))
+    expected = (after - before).norm(dim=-1) / (2 * step)
+    torch.testing.assert_close(match_speed_px(a, b, pixels, inverse_depth), expected)
 
 
 def test_a_view_into_itself_is_the_identity() -> None:
