@@ -1,4 +1,4 @@
-"""Before torch is loaded, and once it is."""
+"""Before torch is loaded. The add-on's tests come by here too, in a Python that has no torch."""
 
 import os
 
@@ -10,8 +10,7 @@ _SHARED = "PYTEST_XDIST_WORKER" in os.environ
 if _SHARED:
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # also for the programs that tests start
 set_waiting_policy()
-
-import torch  # noqa: E402
-
 if _SHARED:
+    import torch
+
     torch.set_num_threads(1)
