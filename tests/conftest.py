@@ -4,13 +4,10 @@ import os
 
 from backend.waiting import set_waiting_policy
 
-_SHARED = "PYTEST_XDIST_WORKER" in os.environ
-"""Whether other tests run at the same time, one to a core."""
-
-if _SHARED:
+if "PYTEST_XDIST_WORKER" in os.environ:  # other tests run at the same time, one to a core
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # also for the programs that tests start
-set_waiting_policy()
-if _SHARED:
     import torch
 
     torch.set_num_threads(1)
+else:
+    set_waiting_policy()

@@ -110,9 +110,7 @@ def warp_pixels(
     inverse_depth: Float[Tensor, "planes height width"],
 ) -> Float[Tensor, "planes height width 2"]:
     """Where the source sees reference pixels at the given inverse depths; far outside where it is behind."""
-    base = pixels @ a[:, :2].T + a[:, 2]  # (height, width, 3)
-    denominator = base[..., 2] + inverse_depth * b[2]
-    denominator = torch.where(denominator > 1e-6, denominator, 1e-9)  # behind: thrown out of the image
+    base, denominator = _in_source(a, b, pixels, inverse_depth)
     where = inverse_depth.new_empty((*inverse_depth.shape, 2))
     for axis in (0, 1):
         torch.div(torch.addcmul(base[..., axis], inverse_depth, b[axis]), denominator, out=where[..., axis])
@@ -126,11 +124,22 @@ def match_speed_px(
     inverse_depth: Float[Tensor, "height width"],
 ) -> Float[Tensor, "height width"]:
     """Pixels by which what `warp_pixels` gives moves in the source, per unit of inverse depth."""
-    base = pixels @ a[:, :2].T + a[:, 2]
-    denominator = base[..., 2] + inverse_depth * b[2]
+    base, denominator = _in_source(a, b, pixels, inverse_depth)
     across = base[..., 2:] * b[:2] - base[..., :2] * b[2]
-    speed: Tensor = across.norm(dim=-1) / torch.where(denominator > 1e-6, denominator, 1e-9).square()
+    speed: Tensor = across.norm(dim=-1) / denominator.square()
     return speed
+
+
+def _in_source(
+    a: Float[Tensor, "3 3"],
+    b: Float[Tensor, "3"],
+    pixels: Float[Tensor, "height width 2"],
+    inverse_depth: Float[Tensor, "*planes height width"],
+) -> tuple[Float[Tensor, "height width 3"], Float[Tensor, "*planes height width"]]:
+    """Where the source sees the pixels at infinity, homogeneous, and the divisor at the inverse depths."""
+    base = pixels @ a[:, :2].T + a[:, 2]
+    divisor = base[..., 2] + inverse_depth * b[2]
+    return base, torch.where(divisor > 1e-6, divisor, 1e-9)  # behind: thrown out of the image
 
 
 def inside(pixels: Float[Tensor, "*batch 2"], width: int, height: int) -> Bool[Tensor, "*batch"]:

@@ -254,7 +254,7 @@ def _refined(current: Map, sources: list[Window], steps_px: list[float], config:
         hypotheses = (middle + offsets * step).clamp(far, near)
         score = _scores(window, sources, hypotheses, config)
         best = score.max(dim=0).values
-        index, offset = lowest_with_neighbours((1 - score).permute(1, 2, 0).contiguous())
+        index, offset = lowest_with_neighbours(1 - score.permute(1, 2, 0))
         current = Map(
             window=window,
             inverse_depth=(middle + (index - 2 + offset) * step).clamp(far, near),
