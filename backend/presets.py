@@ -34,7 +34,7 @@ PRESETS = MappingProxyType(
     {
         "fast": Settings(
             photos=PhotosConfig(max_side_px=800),
-            stereo=StereoConfig(first_pixel_size=2, num_sources=2),
+            stereo=StereoConfig(first_pixel_size=2, num_sources=2, growth_rounds=(1, 2, 2)),
             train=TrainConfig(levels=(32, 64, 96), rounds=(10, 10, 5)),
             mesh=MeshConfig(max_faces=100_000),
         ),

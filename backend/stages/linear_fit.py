@@ -13,7 +13,7 @@ from ..maths.nearest import nearest_tree
 from ..maths.smooth_fit import fit_smooth
 from .measurements import Measurements
 from .rims import RimRays, rim_points, rim_rays
-from .silhouettes import SilhouetteRays, inside_along, least_distance, silhouette_rays
+from .silhouettes import SilhouetteRays, inside_along, least_distance, middles, silhouette_rays
 from .unseen_side import ball_behind, depth_is_bounded
 
 _FADE = 0.7
@@ -38,6 +38,8 @@ class LinearConfig:
     """Where rays through the outline touch the field, if silhouettes bound the depth; else less."""
     prior: float = 1e-3
     """Of the level before, at 32 nodes; more than 0."""
+    settled: float = 0.01
+    """Movement of the surface in a round, in cells on average, below which no further round is asked for."""
 
 
 def start(scene: Measurements, radius: float, nodes: int) -> Float[Tensor, "nodes nodes nodes"]:
@@ -56,7 +58,7 @@ def fit_level(
 
     Smooth is measured against the ball behind, whose curvature is free. Free space (f > 0) and silhouettes
     (f < 0 somewhere on each ray) are inequalities: they pull only where the field says otherwise, which
-    takes a few rounds.
+    takes a few rounds; `rounds` at most, fewer where the surface comes to rest.
     """
     nodes = before.shape[0]
     h = spacing(nodes)
@@ -68,7 +70,7 @@ def fit_level(
     bound = least_distance(scene, nodes)
     free = bound > 0
     through = _seen_through_any(scene, nodes, 3 * h)
-    through_subject, pulled = silhouette_rays(scene, bound), torch.zeros((nodes**3, 2), device=before.device)
+    through_subject, pulled = silhouette_rays(scene, nodes), torch.zeros((nodes**3, 2), device=before.device)
     met_along = torch.full_like(through_subject.entry, torch.inf)
     rays, nearest = rim_rays(scene, nodes), nearest_tree(points[0].cpu().numpy())
     distance = before
@@ -79,7 +81,7 @@ def fit_level(
         carved = through & (distance < 2 * h)
         target[carved], weight[carved] = 2 * h, config.seen_through
         met_along = inside_along(through_subject, distance, met_along)
-        pulled = _FADE * pulled + _pulls(through_subject, met_along.isinf(), nodes)
+        pulled = _FADE * pulled + _pulls(through_subject.chosen(met_along.isinf()), bound)
         rays_near, depths = pulled.reshape(*distance.shape, 2).unbind(-1)
         pull = config.silhouettes * rays_near.clamp(max=1.0) * ~free
         inside = depths / rays_near.clamp(min=1e-6)
@@ -88,18 +90,28 @@ def fit_level(
         total = weight + measured_weight + pull + rim_weight
         target = weight * target + measured_weight * measured.distance
         target += rim_weight * rims.distance - pull * inside
+        last = distance
         distance = ball + fit_smooth(
-            target / total - ball, total, distance - ball, smoothness=config.smoothness, steps=30
+            target / total - ball, total, last - ball, smoothness=config.smoothness, steps=30
         )
+        if _movement(last, distance) < config.settled * h:
+            break
     return distance
 
 
-def _pulls(rays: SilhouetteRays, missed: Bool[Tensor, "rays"], nodes: int) -> Float[Tensor, "cells 2"]:
+def _movement(
+    last: Float[Tensor, "nodes nodes nodes"], distance: Float[Tensor, "nodes nodes nodes"]
+) -> float:
+    """Mean change at the nodes within a cell of the surface, in units of the grid's frame; 0 without any."""
+    near = distance.abs() < spacing(len(distance))
+    return float((distance - last)[near].abs().mean().nan_to_num())
+
+
+def _pulls(missed: SilhouetteRays, bound: Float[Tensor, "nodes nodes nodes"]) -> Float[Tensor, "cells 2"]:
     """At the nodes around the middles of rays that miss the field: 1 for each, and how deep it should be."""
-    depth = rays.depth[missed]
-    return splat(
-        torch.stack([torch.ones_like(depth), depth], dim=-1), locate(rays.middle[missed], nodes), nodes
-    )
+    middle, depth = middles(missed, bound)
+    nodes = bound.shape[0]
+    return splat(torch.stack([torch.ones_like(depth), depth], dim=-1), locate(middle, nodes), nodes)
 
 
 def _rim_distances(

@@ -237,14 +237,14 @@ def _first_guess(views: list[View]) -> tuple[Float64[np.ndarray, "3"], float]:
 
 def _masks_around(points: Float64[np.ndarray, "points 3"], views: list[View]) -> Int64[np.ndarray, "points"]:
     """How many photographs show each point on the subject; 0 where one shows it off the subject."""
-    off, on = np.zeros(len(points), bool), np.zeros(len(points), np.int64)
+    on, left = np.zeros(len(points), np.int64), np.arange(len(points))
     for view in views:
         assert view.mask is not None
-        pixels, depth = projected(points, view.camera)
+        pixels, depth = projected(points[left], view.camera)
         visible = shown(pixels, depth, view.camera)
         column, row = pixels[visible].astype(int).T
-        inside = np.zeros(len(points), bool)
-        inside[visible] = view.mask[row, column] > 0.5
-        off |= visible & ~inside
-        on += inside
-    return np.where(off, 0, on)
+        off = np.zeros(len(left), bool)
+        off[visible] = view.mask[row, column] <= 0.5
+        on[left] = np.where(off, 0, on[left] + visible)
+        left = left[~off]  # soon a few: most points are off the first masks
+    return on

@@ -77,13 +77,13 @@ def _outline(
     down, right = torch.gradient(smooth)
     inner = torch.zeros_like(edge, dtype=torch.bool)
     inner[3:-3, 3:-3] = True  # where a photograph ends is no outline
-    slope = torch.stack([right, down], dim=-1)
+    rows, columns = torch.nonzero(inner & (surely < 0.75), as_tuple=True)
+    slope = torch.stack([right[rows, columns], down[rows, columns]], dim=-1)
     clear = slope.norm(dim=-1) > 0.5  # else two outlines meet
-    rows, columns = torch.nonzero(inner & clear & (surely < 0.75), as_tuple=True)
+    rows, columns, slope = rows[clear], columns[clear], slope[clear]
     blocks, block_of = torch.unique(rows // step * edge.shape[1] + columns // step, return_inverse=True)
     first = torch.full_like(blocks, len(rows))
     first.scatter_reduce_(0, block_of, torch.arange(len(rows), device=edge.device), "amin")
-    rows, columns = rows[first], columns[first]
-    across = F.normalize(slope[rows, columns], dim=-1)
+    rows, columns, across = rows[first], columns[first], F.normalize(slope[first], dim=-1)
     pixels = torch.stack([columns, rows], dim=-1) + 0.5
     return pixels - across * edge[rows, columns, None], across

@@ -39,20 +39,23 @@ class SilhouetteRays:
     """Unit vectors."""
     entry: Float[Tensor, "rays"]
     """Where a ray comes near the grid, as far from its origin."""
-    middle: Float[Tensor, "rays 3"]
-    """Of the places on a ray that may be inside as far as all other silhouettes know."""
-    depth: Float[Tensor, "rays"]
-    """How deep inside the middle may be: as far as from the outline, but not more than a cell."""
+    from_outline: Float[Tensor, "rays"]
+    """Distance of the ray from the outline's rays, in units of the distance from the origin."""
+
+    def chosen(self, which: Bool[Tensor, "rays"]) -> "SilhouetteRays":
+        """Some of them."""
+        return SilhouetteRays(
+            origins=self.origins[which],
+            directions=self.directions[which],
+            entry=self.entry[which],
+            from_outline=self.from_outline[which],
+        )
 
 
-def silhouette_rays(scene: Measurements, bound: Float[Tensor, "nodes nodes nodes"]) -> SilhouetteRays:
-    """As many rays as the grid of `bound` (of least_distance) needs.
-
-    A ray on which nothing may be inside is contradicted by another photograph, and left out.
-    """
-    nodes = bound.shape[0]
+def silhouette_rays(scene: Measurements, nodes: int) -> SilhouetteRays:
+    """As many rays as a grid of so many nodes needs."""
     none = scene.positions[:0]
-    parts = [[none, none, none[:, 0], none, none[:, 0]]]
+    parts = [[none, none, none[:, 0], none[:, 0]]]
     for camera, outline in zip(scene.cameras, scene.certain, strict=True):
         if outline is None:
             continue
@@ -64,18 +67,31 @@ def silhouette_rays(scene: Measurements, bound: Float[Tensor, "nodes nodes nodes
         rows, columns, directions = rows[meets], columns[meets], directions[meets]
         origins = camera.position.expand_as(directions)
         entry = sphere_entry(origins / _AROUND, directions) * _AROUND
-        along = entry[:, None] + torch.linspace(0, 2 * _AROUND, 2 * nodes, device=entry.device)
-        points = points_along(origins, directions, along)
-        allowed = (read(bound, points.reshape(-1, 3)) < 0).reshape(along.shape).cumsum(dim=1)
-        middle = torch.searchsorted(allowed, (allowed[:, -1:] + 1) // 2)
-        chosen = allowed[:, -1] > 0
-        at = along.gather(1, middle.clamp(max=along.shape[1] - 1))[:, 0]
         inside_px = -outline[rows * step, columns * step]
-        depth = (inside_px * at / camera.intrinsics[0, 0]).clamp(max=spacing(nodes))
-        part = [origins, directions, entry, origins + at[:, None] * directions, depth]
-        parts.append([column[chosen] for column in part])
-    origins, directions, entry, middle, depth = (torch.cat(column) for column in zip(*parts, strict=True))
-    return SilhouetteRays(origins=origins, directions=directions, entry=entry, middle=middle, depth=depth)
+        parts.append([origins, directions, entry, inside_px / camera.intrinsics[0, 0]])
+    origins, directions, entry, from_outline = (torch.cat(column) for column in zip(*parts, strict=True))
+    return SilhouetteRays(origins=origins, directions=directions, entry=entry, from_outline=from_outline)
+
+
+def middles(
+    rays: SilhouetteRays, bound: Float[Tensor, "nodes nodes nodes"]
+) -> tuple[Float[Tensor, "possible 3"], Float[Tensor, "possible"]]:
+    """Where a ray that misses the field should be inside, and how deep.
+
+    In the middle of all places that may be inside as far as `bound` (of least_distance) knows; as deep as
+    it is from the outline, but not more than a cell. A ray on which nothing may be inside is contradicted
+    by another photograph, and left out.
+    """
+    nodes = bound.shape[0]
+    along = rays.entry[:, None] + torch.linspace(0, 2 * _AROUND, 2 * nodes, device=bound.device)
+    points = points_along(rays.origins, rays.directions, along)
+    allowed = (read(bound, points.reshape(-1, 3)) < 0).reshape(along.shape).cumsum(dim=1)
+    possible = allowed[:, -1] > 0
+    index = torch.searchsorted(allowed, (allowed[:, -1:] + 1) // 2)[possible]
+    at = along[possible].gather(1, index)
+    middle = rays.origins[possible] + at * rays.directions[possible]
+    depth = (rays.from_outline[possible] * at[:, 0]).clamp(max=spacing(nodes))
+    return middle, depth
 
 
 def inside_along(

@@ -1,6 +1,7 @@
 """Capsules before cameras: where silhouettes let them be, which rays miss a field, and how deep they are."""
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,10 +14,11 @@ from torch import Tensor
 from backend.maths.geometry import Pinhole, pixel_centres, ray_directions
 from backend.maths.grid import node_positions, read, spacing
 from backend.maths.rays import first_crossing
-from backend.stages import unseen_depth
+from backend.maths.smooth_fit import fit_smooth
+from backend.stages import linear_fit, unseen_depth
 from backend.stages.linear_fit import LinearConfig
 from backend.stages.measurements import Measurements
-from backend.stages.silhouettes import inside_along, least_distance, missing, silhouette_rays
+from backend.stages.silhouettes import inside_along, least_distance, middles, missing, silhouette_rays
 from backend.stages.unseen_depth import depth_behind
 from backend.stages.unseen_side import DEEPEST, ball_behind, explained_radius
 
@@ -102,23 +104,23 @@ def test_nothing_is_bounded_away_from_the_body() -> None:
 
 def test_the_middle_of_a_ray_lies_where_no_silhouette_forbids_it() -> None:
     scene = seen([-20.0, 0.0, 20.0], -0.5)
-    rays = silhouette_rays(scene, least_distance(scene, NODES))
+    middle, depth = middles(silhouette_rays(scene, NODES), least_distance(scene, NODES))
     on = sum(int((edge < 0).sum()) for edge in scene.outlines if edge is not None)
-    assert len(rays.origins) > 0.1 * on
+    assert len(middle) > 0.1 * on
     for camera, edge in zip(scene.cameras, scene.outlines, strict=True):
         assert edge is not None
-        homogeneous = rays.middle @ camera.camera_from_object[:3, :3].T + camera.camera_from_object[:3, 3]
+        homogeneous = middle @ camera.camera_from_object[:3, :3].T + camera.camera_from_object[:3, 3]
         pixels = (homogeneous @ camera.intrinsics.T)[:, :2] / homogeneous[:, 2:]
         column, row = pixels.long().clamp(0, SIZE - 1).T
         assert (edge[row, column] < 2.5).all(), "a cell is about three pixels"
-    assert (rays.depth > 0).all()
-    assert (rays.depth <= spacing(NODES)).all()
+    assert (depth > 0).all()
+    assert (depth <= spacing(NODES)).all()
 
 
 @pytest.mark.parametrize("thinner", [0.0, 0.1, 0.3], ids=["the same", "thinner", "gone"])
 def test_what_an_earlier_field_knew_changes_nothing(thinner: float) -> None:
     scene = seen([-20.0, 0.0, 20.0], -0.5)
-    rays = silhouette_rays(scene, least_distance(scene, NODES))
+    rays = silhouette_rays(scene, NODES)
     field = capsule(node_positions(NODES, CPU), -0.5)
     before = inside_along(rays, field, torch.full_like(rays.entry, torch.inf))
     along = inside_along(rays, field + thinner, before)
@@ -130,17 +132,18 @@ def test_what_an_earlier_field_knew_changes_nothing(thinner: float) -> None:
 
 def test_a_ray_that_another_photograph_contradicts_is_left_out() -> None:
     scene = seen([-20.0, 20.0], -0.5)
-    num_rays = len(silhouette_rays(scene, least_distance(scene, NODES)).origins)
+    rays = silhouette_rays(scene, NODES)
+    assert len(middles(rays, least_distance(scene, NODES))[0]) > 0.95 * len(rays.origins) > 200
     nothing = torch.full((SIZE, SIZE), 50.0)
     nothing[:4, :4] = -1
     scene.outlines[1] = scene.certain[1] = nothing
-    assert num_rays > 200
-    assert len(silhouette_rays(scene, least_distance(scene, NODES)).origins) < 0.02 * num_rays
+    rays = silhouette_rays(scene, NODES)
+    assert len(middles(rays, least_distance(scene, NODES))[0]) < 0.02 * len(rays.origins)
 
 
 def test_no_ray_misses_the_body_itself_and_all_miss_what_is_not_there() -> None:
     scene = seen([-20.0, 0.0, 20.0], -0.5)
-    rays = silhouette_rays(scene, least_distance(scene, NODES))
+    rays = silhouette_rays(scene, NODES)
     distance = capsule(node_positions(NODES, CPU), -0.5)
     assert missing(rays, distance).float().mean() < 0.01
     assert missing(rays, distance.abs() + 0.01).all()
@@ -149,7 +152,7 @@ def test_no_ray_misses_the_body_itself_and_all_miss_what_is_not_there() -> None:
 def test_no_ray_leaps_over_a_small_ball() -> None:
     """(|x - c|^2 - r^2) / 2r grows with |x|^2 / 2r: a step of its value would end far behind the ball."""
     scene = seen([-20.0, 0.0, 20.0], 0.3)
-    rays = silhouette_rays(scene, least_distance(scene, NODES))
+    rays = silhouette_rays(scene, NODES)
     ball = ball_behind(scene, 0.3, NODES)
     positions = node_positions(NODES, CPU)[ball < 0]
     towards = F.normalize(positions.mean(dim=0) - rays.origins, dim=-1)
@@ -194,3 +197,24 @@ def test_without_silhouettes_nothing_is_tried(monkeypatch: pytest.MonkeyPatch) -
 
     monkeypatch.setattr(unseen_depth, "fit_level", tried)
     assert depth_behind(scene, LinearConfig())[0] == explained_radius(scene)
+
+
+def test_rounds_end_where_the_surface_comes_to_rest(monkeypatch: pytest.MonkeyPatch) -> None:
+    scene, rounds = seen([-20.0, 0.0, 20.0], 0.2, measured_from=-1.0), []
+
+    def counted(*args: Any, **kwargs: Any) -> Tensor:
+        rounds.append(1)
+        return fit_smooth(*args, **kwargs)
+
+    def fitted(settled: float) -> tuple[Tensor, int]:
+        rounds.clear()
+        config, radius = LinearConfig(settled=settled), explained_radius(scene)
+        start = linear_fit.start(scene, radius, NODES)
+        return linear_fit.fit_level(scene, start, radius, 20, config), len(rounds)
+
+    monkeypatch.setattr(linear_fit, "fit_smooth", counted)
+    (asked, all_rounds), (rested, fewer) = fitted(0.0), fitted(LinearConfig().settled)
+    assert all_rounds == 20
+    assert 2 <= fewer <= 16
+    near = asked.abs() < spacing(NODES)
+    assert (rested - asked)[near].abs().mean() < 0.1 * spacing(NODES)
