@@ -4,6 +4,7 @@ from dataclasses import dataclass, field
 from types import MappingProxyType
 
 from .stages.cameras import CamerasConfig
+from .stages.linear_fit import LinearConfig
 from .stages.mesh import MeshConfig
 from .stages.networks import HashConfig, NetworkConfig
 from .stages.neus_fit import NeusConfig
@@ -35,7 +36,7 @@ PRESETS = MappingProxyType(
         "fast": Settings(
             photos=PhotosConfig(max_side_px=800),
             stereo=StereoConfig(first_pixel_size=2, num_sources=2, growth_rounds=(1, 2, 2)),
-            train=TrainConfig(levels=(32, 64, 96), rounds=(10, 10, 5)),
+            train=TrainConfig(levels=(32, 64, 96), rounds=(10, 10, 5), linear=LinearConfig(settled=0.01)),
             mesh=MeshConfig(max_faces=100_000),
         ),
         "balanced": Settings(photos=PhotosConfig(max_side_px=1024)),

@@ -38,7 +38,7 @@ class LinearConfig:
     """Where rays through the outline touch the field, if silhouettes bound the depth; else less."""
     prior: float = 1e-3
     """Of the level before, at 32 nodes; more than 0."""
-    settled: float = 0.01
+    settled: float = 0.005
     """Movement of the surface in a round, in cells on average, below which no further round is asked for."""
 
 
