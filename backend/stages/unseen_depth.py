@@ -11,7 +11,7 @@ from .unseen_side import DEEPEST, depth_is_bounded, explained_radius, is_all_aro
 _NODES = 48
 _ROUNDS = 6
 """Of each trial."""
-_MENDED = 0.03
+_MENDED = 0.035
 """Share of the rays through the subject that may be missed so: the pull of silhouettes mends as many. A
 deeper ball than needed is worse than that, most of all for what is not seen."""
 _GROWTH = 1.2
