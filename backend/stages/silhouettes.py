@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from ..maths.evidence import half_cell_px, off_silhouette
@@ -82,16 +82,27 @@ def middles(
     it is from the outline, but not more than a cell. A ray on which nothing may be inside is contradicted
     by another photograph, and left out.
     """
-    nodes = bound.shape[0]
-    along = rays.entry[:, None] + torch.linspace(0, 2 * _AROUND, 2 * nodes, device=bound.device)
-    points = points_along(rays.origins, rays.directions, along)
-    allowed = (read(bound, points.reshape(-1, 3)) < 0).reshape(along.shape).cumsum(dim=1)
+    along, allowed = _allowed(rays, bound)
     possible = allowed[:, -1] > 0
     index = torch.searchsorted(allowed, (allowed[:, -1:] + 1) // 2)[possible]
     at = along[possible].gather(1, index)
     middle = rays.origins[possible] + at * rays.directions[possible]
-    depth = (rays.from_outline[possible] * at[:, 0]).clamp(max=spacing(nodes))
+    depth = (rays.from_outline[possible] * at[:, 0]).clamp(max=spacing(len(bound)))
     return middle, depth
+
+
+def uncontradicted(rays: SilhouetteRays, bound: Float[Tensor, "nodes nodes nodes"]) -> SilhouetteRays:
+    """The rays on which something may be inside as far as `bound` (of least_distance) knows."""
+    return rays.chosen(_allowed(rays, bound)[1][:, -1] > 0)
+
+
+def _allowed(
+    rays: SilhouetteRays, bound: Float[Tensor, "nodes nodes nodes"]
+) -> tuple[Float[Tensor, "rays places"], Int[Tensor, "rays places"]]:
+    """Places along each ray, and how many up to each may be inside."""
+    along = rays.entry[:, None] + torch.linspace(0, 2 * _AROUND, 2 * len(bound), device=bound.device)
+    points = points_along(rays.origins, rays.directions, along)
+    return along, (read(bound, points.reshape(-1, 3)) < 0).reshape(along.shape).cumsum(dim=1)
 
 
 def inside_along(

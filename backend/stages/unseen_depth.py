@@ -5,7 +5,7 @@ from dataclasses import replace
 from ..scene import Decision
 from .linear_fit import LinearConfig, fit_level, start
 from .measurements import Measurements
-from .silhouettes import least_distance, middles, missing, silhouette_rays
+from .silhouettes import least_distance, missing, silhouette_rays, uncontradicted
 from .unseen_side import DEEPEST, depth_is_bounded, explained_radius, is_all_around, widest_view_angle_deg
 
 _NODES = 48
@@ -40,14 +40,16 @@ def _met_radius(scene: Measurements, explained: float, config: LinearConfig) -> 
     Rays through the subject that miss a surface fitted without them say that it goes on, farther back. Where
     silhouettes bound the depth there is nothing to find out.
     """
-    bound, rays = least_distance(scene, _NODES), silhouette_rays(scene, _NODES)
-    if depth_is_bounded(scene) == 1 or not len(rays.origins):
+    if depth_is_bounded(scene) == 1:
+        return explained
+    rays = uncontradicted(silhouette_rays(scene, _NODES), least_distance(scene, _NODES))
+    if not len(rays.origins):
         return explained
     alone = replace(config, silhouettes=0.0)
 
     def num_missed(radius: float) -> int:
         trial = fit_level(scene, start(scene, radius, _NODES), radius, _ROUNDS, alone)
-        return len(middles(rays.chosen(missing(rays, trial)), bound)[0])
+        return int(missing(rays, trial).sum())
 
     unavoidable = num_missed(DEEPEST)
     if num_missed(explained) - unavoidable <= _MENDED * len(rays.origins):
