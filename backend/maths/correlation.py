@@ -1,12 +1,13 @@
 """Agreement of image patches, robust to exposure and to noise.
 
-Window sums go through running sums, so that their cost does not depend on the window; images are
-first freed of their local mean, which keeps those running sums small and float32 exact enough.
+Window sums are put together from sums of 1, 2, 4, ... neighbours: their cost grows with the logarithm of
+the window, and unlike differences of running sums they lose nothing where the rest of the image is bright.
 """
 
 from dataclasses import dataclass
 
 import torch
+import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
@@ -14,29 +15,25 @@ from torch import Tensor
 def window_sum(
     values: Float[Tensor, "*batch height width"], radius: int
 ) -> Float[Tensor, "*batch height width"]:
-    """Sum over the (2 radius + 1)^2 window around every pixel; nothing is added beyond the border.
+    """Sum over the (2 radius + 1)^2 window around every pixel; nothing is added beyond the border."""
+    return _sum_along(_sum_along(values, -1, radius), -2, radius)
 
-    ValueError if the image is not larger than the window along both axes.
-    """
-    for axis in (-1, -2):
-        running = values.cumsum(axis)
-        count = values.shape[axis]
-        width = 2 * radius + 1
-        if count <= width:
-            raise ValueError(f"a window of {width} pixels needs a larger image than {tuple(values.shape)}")
-        values = torch.empty_like(running)
-        values.narrow(axis, 0, radius + 1).copy_(running.narrow(axis, radius, radius + 1))
-        torch.sub(
-            running.narrow(axis, width, count - width),
-            running.narrow(axis, 0, count - width),
-            out=values.narrow(axis, radius + 1, count - width),
-        )
-        torch.sub(
-            running.narrow(axis, count - 1, 1),
-            running.narrow(axis, count - width, radius),
-            out=values.narrow(axis, count - radius, radius),
-        )
-    return values
+
+def _sum_along(
+    values: Float[Tensor, "*batch height width"], axis: int, radius: int
+) -> Float[Tensor, "*batch height width"]:
+    """Put together from the sums of 1, 2, 4, ... neighbours."""
+    count, width = values.shape[axis], 2 * radius + 1
+    block = F.pad(values, (radius, radius) if axis == -1 else (0, 0, radius, radius))
+    total, start, size = block.narrow(axis, 0, count), 1, 1
+    while 2 * size <= width:
+        shorter = block.shape[axis] - size
+        block = block.narrow(axis, 0, shorter) + block.narrow(axis, size, shorter)
+        size *= 2
+        if width & size:
+            total = total + block.narrow(axis, start, count)
+            start += size
+    return total
 
 
 def window_mean(
@@ -66,6 +63,17 @@ class PatchStatistics:
     mean: Float[Tensor, "height width"]
     variance: Float[Tensor, "height width"]
     radius: int
+
+    def part(self, rows: slice, columns: slice) -> "PatchStatistics":
+        """Of some pixels; patches at its borders are cut there."""
+        return PatchStatistics(
+            image=self.image[rows, columns],
+            subject=self.subject[rows, columns],
+            count=self.count[rows, columns],
+            mean=self.mean[rows, columns],
+            variance=self.variance[rows, columns],
+            radius=self.radius,
+        )
 
 
 def patch_statistics(

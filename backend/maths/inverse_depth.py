@@ -11,7 +11,6 @@ from jaxtyping import Bool, Float, Float32, Int, Int64
 from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 
-from .correlation import window_sum
 from .geometry import Pinhole, pixel_centres
 from .pieces import connected_pieces
 
@@ -25,27 +24,24 @@ def fit_planes(
     0.01 / (0.01 + variance of the window's pixels), 0.5 % for a full window of radius 2. What is
     measured where the weight is 0 has no say, whatever it is.
     """
-    height, width = inverse_depth.shape
-    pixels = pixel_centres(width, height, inverse_depth.device)
-    u = pixels[..., 0] - width / 2
-    v = pixels[..., 1] - height / 2
-    w = torch.where(weight > 0, inverse_depth, 0.0)
-    terms = torch.stack([weight, weight * u, weight * v, weight * w, weight * u * u, weight * u * v])
-    terms = torch.cat([terms, torch.stack([weight * v * v, weight * u * w, weight * v * w])]).double()
-    s = window_sum(terms, radius)
-    total = s[0].clamp(min=1e-9)
-    mean_u, mean_v, mean_w = s[1] / total, s[2] / total, s[3] / total
+    offsets = torch.arange(-radius, radius + 1, dtype=weight.dtype, device=weight.device)
+    v, u = torch.meshgrid(offsets, offsets, indexing="ij")
+    moments = torch.stack([torch.ones_like(u), u, v, u * u, u * v, v * v])[:, None]
+    # less a mean, so that small slopes are not lost beside it
+    usual = (weight * torch.where(weight > 0, inverse_depth, 0.0)).sum() / weight.sum().clamp(min=1e-9)
+    beyond = torch.where(weight > 0, weight * (inverse_depth - usual), 0.0)
+    of_weight = F.conv2d(weight[None, None], moments, padding=radius)[0]
+    of_values = F.conv2d(beyond[None, None], moments[:3], padding=radius)[0]
+    total = of_weight[0].clamp(min=1e-9)
+    mean_u, mean_v, mean_uu, mean_uv, mean_vv = of_weight[1:] / total
+    mean_w, mean_uw, mean_vw = of_values / total
     prior = 1e-2
-    uu = s[4] / total - mean_u**2 + prior
-    uv = s[5] / total - mean_u * mean_v
-    vv = s[6] / total - mean_v**2 + prior
-    uw = s[7] / total - mean_u * mean_w
-    vw = s[8] / total - mean_v * mean_w
+    uu, uv, vv = mean_uu - mean_u**2 + prior, mean_uv - mean_u * mean_v, mean_vv - mean_v**2 + prior
+    uw, vw = mean_uw - mean_u * mean_w, mean_vw - mean_v * mean_w
     determinant = uu * vv - uv * uv
     slope_u = (vv * uw - uv * vw) / determinant
     slope_v = (uu * vw - uv * uw) / determinant
-    value = mean_w + slope_u * (u - mean_u) + slope_v * (v - mean_v)
-    return torch.stack([value, slope_u, slope_v]).float()
+    return torch.stack([usual + mean_w - slope_u * mean_u - slope_v * mean_v, slope_u, slope_v])
 
 
 def normals_from_planes(

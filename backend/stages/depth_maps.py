@@ -9,7 +9,7 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float, Shaped
 from torch import Tensor
 
-from ..maths.correlation import correlation, window_mean, window_sum
+from ..maths.correlation import window_mean, window_sum
 from ..maths.geometry import (
     Pinhole,
     epipolar_map,
@@ -19,7 +19,6 @@ from ..maths.geometry import (
     project,
     sample_image,
     unproject,
-    warp_pixels,
 )
 from ..maths.inverse_depth import (
     distance_from_edges_px,
@@ -30,8 +29,9 @@ from ..maths.inverse_depth import (
 from ..maths.median import median_3x3
 from ..maths.semi_global import aggregate
 from ..scene import Progress, within
+from .patch_agreement import agreement
 from .stereo_config import StereoConfig
-from .stereo_windows import Window
+from .stereo_windows import Window, views_between
 
 _LEAST_FOR_A_PLANE = 12
 """Seeds in a window that make its plane worth continuing."""
@@ -144,13 +144,16 @@ def _grown(
     planes = fit_planes(current.inverse_depth, seeds * current.score.clamp(min=0) ** 2, radius)
     known = window_sum(seeds.float(), radius) >= _LEAST_FOR_A_PLANE
     planes_beside = []
-    for du, dv in ((0, 0), (reach, 0), (-reach, 0), (0, reach), (0, -reach)):
+    shifts = ((0, 0), (reach, 0), (-reach, 0), (0, reach), (0, -reach))
+    for du, dv in shifts:
         value, slope_u, slope_v = _moved(planes, du, dv)
         continued = (value - du * slope_u - dv * slope_v).clamp(far, near)
         planes_beside.append(torch.where(_moved(known, du, dv), continued, current.inverse_depth))
     hypotheses = torch.stack(planes_beside)
-    score, index = _scores(window, sources, hypotheses, config).max(dim=0)
-    better = ~seeds & (score > current.score)
+    beside = torch.stack([_moved(known, *shift) for shift in shifts]).any(dim=0)
+    asked = window.subject & beside & ~seeds
+    score, index = agreement(window, sources, hypotheses, asked).max(dim=0)
+    better = asked & (score > current.score)
     chosen = hypotheses.gather(0, index[None])[0]
     grown = Map(
         window=window,
@@ -178,7 +181,7 @@ def _sweep(window: Window, sources: list[Window], config: StereoConfig) -> Map:
     count = int(np.clip(math.ceil((near - far) / step), 16, config.num_planes)) + 1
     planes = torch.linspace(far, near, count, device=window.grey.device)
     chunks = [
-        _scores(window, sources, chunk[:, None, None].expand(-1, *window.grey.shape), config)
+        agreement(window, sources, chunk[:, None, None].expand(-1, *window.grey.shape), window.subject)
         for chunk in planes.tensor_split(math.ceil(count / 16))
     ]
     score = torch.cat(chunks)
@@ -215,31 +218,6 @@ def _step_of_one_pixel(
     return 1 / speed.clamp(min=1e-6)
 
 
-def _scores(
-    window: Window,
-    sources: list[Window],
-    inverse_depth: Float[Tensor, "planes height width"],
-    config: StereoConfig,
-) -> Float[Tensor, "planes height width"]:
-    """Agreement of each pixel's patch with the sources, in [-1, 1].
-
-    A soft maximum over sources: where one of them is hidden behind something, the others decide.
-    """
-    pixels = pixel_centres(window.camera.width, window.camera.height, window.grey.device)
-    per_source = []
-    for source in sources:
-        a, b = epipolar_map(source.camera, window.camera)
-        where = warp_pixels(a, b, pixels, inverse_depth)
-        warped = sample_image(source.grey[None], where)[:, 0]
-        score = correlation(window.patches, warped, max(window.noise, source.noise))
-        seen = inside(where, source.camera.width, source.camera.height)
-        per_source.append(torch.where(seen, score, -1.0))
-    if len(per_source) == 1:
-        return per_source[0]
-    stacked = torch.stack(per_source)
-    return (stacked * torch.softmax(stacked / 0.15, dim=0)).sum(dim=0)
-
-
 def _refined(current: Map, sources: list[Window], steps_px: list[float], config: StereoConfig) -> Map:
     """Five hypotheses around planes fitted to the map so far, once for each step width."""
     if not sources:
@@ -252,14 +230,12 @@ def _refined(current: Map, sources: list[Window], steps_px: list[float], config:
         middle = _smoothed(current, config.patch_radius)
         step = step_px * _step_of_one_pixel(window, maps, middle)
         hypotheses = (middle + offsets * step).clamp(far, near)
-        score = _scores(window, sources, hypotheses, config)
+        score = agreement(window, sources, hypotheses, window.subject)
         best = score.max(dim=0).values
         index, offset = lowest_with_neighbours(1 - score.permute(1, 2, 0))
-        current = Map(
-            window=window,
-            inverse_depth=(middle + (index - 2 + offset) * step).clamp(far, near),
-            score=best,
-        )
+        better = (middle + (index - 2 + offset) * step).clamp(far, near)
+        # what no source sees is not moved
+        current = Map(window=window, inverse_depth=torch.where(best > -1, better, middle), score=best)
     return current
 
 
@@ -271,7 +247,7 @@ def _sharpness(
     Next to nothing where an edge runs along the epipolar line, however well the patches agree.
     """
     beside = torch.stack([current.inverse_depth - step, current.inverse_depth, current.inverse_depth + step])
-    scores = _scores(current.window, sources, beside, config)
+    scores = agreement(current.window, sources, beside, current.window.subject)
     return scores[1] - 0.5 * (scores[0] + scores[2])
 
 
@@ -327,36 +303,54 @@ def _measured(
 def _agreement(
     index: int, maps: list[Map], nearby: list[list[int]], config: StereoConfig
 ) -> Float[Tensor, "height width"]:
-    """How many views agree with each pixel's depth (itself counted), 0 where it is not a measurement."""
+    """How many views agree with each pixel's depth (itself counted), 0 where it is not a measurement.
+
+    What two views see, a view between them sees as well. If it is compared, and has found another depth
+    there, the two agree by chance.
+    """
     own = maps[index]
     pixels = pixel_centres(own.window.camera.width, own.window.camera.height, own.window.grey.device)
     points = unproject(own.window.camera, pixels, 1 / own.inverse_depth.clamp(min=1e-6))
+    compared = [
+        other
+        for other in range(len(maps))
+        if other in nearby[index] or (other != index and index in nearby[other])
+    ]
+    said = {other: _judged(points, pixels, own, maps[other], config) for other in compared}
+    cameras = [map_.window.camera for map_ in maps]
     votes = torch.ones_like(own.inverse_depth)
-    for other in range(len(maps)):
-        if other == index or (other not in nearby[index] and index not in nearby[other]):
-            continue
-        votes += _confirms(points, pixels, own, maps[other], config)
+    for other, (agrees, _) in said.items():
+        by_chance = torch.zeros_like(agrees)
+        confirmed = torch.zeros_like(agrees)
+        for k in views_between(cameras, index, other):
+            if k in said:
+                confirmed |= said[k][0]
+                by_chance |= said[k][1]
+        votes += agrees & (confirmed | ~by_chance)
     good = own.window.subject & (own.score > config.min_correlation) & (points.norm(dim=-1) < 1.0)
     return torch.where(good & (votes > 1), votes, 0.0)
 
 
-def _confirms(
+def _judged(
     points: Float[Tensor, "height width 3"],
     pixels: Float[Tensor, "height width 2"],
     own: Map,
     other: Map,
     config: StereoConfig,
-) -> Bool[Tensor, "height width"]:
-    """True where the other map's point, seen from here, falls on the pixel it came from and has its depth."""
+) -> tuple[Bool[Tensor, "height width"], Bool[Tensor, "height width"]]:
+    """Whether another view agrees with the points, and whether it has found something else where they are.
+
+    It agrees where its own point, seen from here, falls on the pixel that was asked for and has its depth.
+    """
     seen_at, depth = project(other.window.camera, points)
-    ok = inside(seen_at, other.window.camera.width, other.window.camera.height) & (depth > 0)
     both = torch.stack([other.inverse_depth, other.score])
     inverse_depth, score = sample_image(both, seen_at[None])[0]
+    found = inside(seen_at, other.window.camera.width, other.window.camera.height) & (depth > 0)
+    found &= score > config.min_correlation - 0.1
     there = unproject(other.window.camera, seen_at, 1 / inverse_depth.clamp(min=1e-6))
     back_at, back_depth = project(own.window.camera, there)
     moved = (back_at - pixels).norm(dim=-1)
     step = 1 / own.inverse_depth.clamp(min=1e-6)
     relative = (back_depth - step).abs() / step
-    confirmed: Bool[Tensor, "height width"] = ok & (score > config.min_correlation - 0.1)
-    confirmed &= (moved < config.max_reprojection_px) & (relative < 0.01)
-    return confirmed
+    same = (moved < config.max_reprojection_px) & (relative < 0.01)
+    return found & same, found & ~same

@@ -14,6 +14,9 @@ from ..maths.geometry import Pinhole, pinhole_in_object, pixel_centres, unprojec
 from ..scene import Region, View
 from .stereo_config import StereoConfig
 
+_DETOUR = 1.25
+"""A view is between two others if the way past it is at most so many times as long."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class Window:
@@ -109,9 +112,7 @@ def neighbours(cameras: list[Pinhole], count: int) -> list[list[int]]:
     The wish is 5 to 25 degrees seen from the middle of the region; wider pairs are taken where there
     is nothing nearer, up to 75 degrees.
     """
-    directions = F.normalize(torch.stack([camera.position for camera in cameras]), dim=-1)
-    cosines = (directions @ directions.T).clamp(-1, 1)
-    angles_deg = torch.rad2deg(torch.arccos(cosines))
+    angles_deg = _angles_deg(cameras)
     chosen = []
     for i in range(len(cameras)):
         costs = sorted(
@@ -121,6 +122,23 @@ def neighbours(cameras: list[Pinhole], count: int) -> list[list[int]]:
         )
         chosen.append([j for _, j in costs[:count]])
     return chosen
+
+
+def views_between(cameras: list[Pinhole], one: int, other: int) -> list[int]:
+    """The views past which two others look at the region: about on the way from one to the other."""
+    angles_deg = _angles_deg(cameras)
+    way_deg = angles_deg[one] + angles_deg[other]
+    return [
+        k
+        for k in range(len(cameras))
+        if k not in (one, other) and way_deg[k] < _DETOUR * angles_deg[one, other]
+    ]
+
+
+def _angles_deg(cameras: list[Pinhole]) -> Float[Tensor, "views views"]:
+    """Between the views, seen from the middle of the region."""
+    directions = F.normalize(torch.stack([camera.position for camera in cameras]), dim=-1)
+    return torch.rad2deg(torch.arccos((directions @ directions.T).clamp(-1, 1)))
 
 
 def _pair_cost(angle_deg: float) -> float:

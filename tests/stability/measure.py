@@ -10,6 +10,7 @@ from tests.stability import (
     test_neus_weights,
     test_sampling,
     test_volume_rendering,
+    test_windows,
 )
 from tests.stability.sweep import Sweep
 
@@ -21,6 +22,7 @@ SECTIONS: dict[str, tuple[Sweep, ...]] = {
     "NeuS weights": test_neus_weights.SWEEPS,
     "Distances, gradients, losses": test_distance_gradients.SWEEPS,
     "Sampling and encoding": test_sampling.SWEEPS,
+    "Windows of pictures": test_windows.SWEEPS,
     "Meshes": test_meshes.SWEEPS,
 }
 

@@ -9,10 +9,14 @@ import torch
 from scipy.ndimage import distance_transform_edt, gaussian_filter
 
 from backend.errors import Cancelled, ErrorCode, ReconstructionError
+from backend.maths.geometry import pinhole_in_object
+from backend.maths.raycast import camera_rays
 from backend.scene import Camera, Region, View, no_progress, transform_points
 from backend.stages.stereo import StereoResult, match_views
 from backend.stages.stereo_config import StereoConfig
+from backend.stages.stereo_windows import views_between
 from tests.synthetic_scene import (
+    CENTRE,
     SIZE,
     Scene,
     arc_cameras,
@@ -26,6 +30,8 @@ from tests.synthetic_scene import (
 
 OBJECT_UNIT = 1.2 * SIZE
 """Of the region's object frame, in world units."""
+PLATE = CENTRE - [0, 0.8 * SIZE, 0]
+"""The middle of a square across y, nearer to the cameras than the body."""
 
 
 def match(views: tuple[View, ...]) -> StereoResult:
@@ -260,6 +266,52 @@ def test_a_run_repeats_to_the_bit() -> None:
 
 
 # what must not be measured
+
+
+@cache
+def with_a_plate() -> tuple[View, ...]:
+    """A square before the body, in the outer photographs only: the middle one shows what is behind it."""
+    first, middle, last = photographed(arc_cameras(3, 30, 320)).views
+    return plate_added(first), middle, plate_added(last)
+
+
+def plate_added(view: View) -> View:
+    origins, directions = camera_rays(view.camera)
+    outwards = np.array([0.0, -1.0, 0.0])
+    along = ((PLATE - origins) @ outwards) / (directions @ outwards)
+    points = origins + along[:, None] * directions
+    on_plate = (np.abs(points - PLATE).max(axis=1) < 0.3 * SIZE).reshape(view.image_srgb.shape[:2])
+    image = view.image_srgb.copy()
+    image[on_plate] = texture_srgb(points).reshape(image.shape)[on_plate]
+    return replace(view, image_srgb=image)
+
+
+def points_on_the_plate(result: StereoResult) -> int:
+    return int((np.abs(world_points(result)[:, 1] - PLATE[1]) < 0.02 * SIZE).sum())
+
+
+def test_what_two_views_see_past_a_third_that_sees_something_else_is_chance() -> None:
+    """Two photographs alone would measure the plate."""
+    first, middle, last = with_a_plate()
+    chance = points_on_the_plate(match((first, last)))
+    assert chance > 2000
+    assert points_on_the_plate(match((first, middle, last))) < 0.02 * chance
+
+
+def test_a_view_between_two_that_shows_nothing_does_not_contradict_them() -> None:
+    first, middle, last = with_a_plate()
+    black = replace(middle, image_srgb=np.zeros_like(middle.image_srgb))
+    without = points_on_the_plate(match((first, last)))
+    assert points_on_the_plate(match((first, black, last))) > 0.9 * without
+
+
+def test_views_between_are_about_on_the_way() -> None:
+    cameras = [
+        pinhole_in_object(camera, true_region(), torch.device("cpu")) for camera in arc_cameras(5, 60, 160)
+    ]
+    assert views_between(cameras, 0, 2) == [1]
+    assert views_between(cameras, 4, 0) == [1, 2, 3]
+    assert views_between(cameras, 1, 2) == []
 
 
 def test_nothing_off_the_mask_is_kept() -> None:
