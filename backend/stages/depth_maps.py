@@ -320,13 +320,12 @@ def _agreement(
     cameras = [map_.window.camera for map_ in maps]
     votes = torch.ones_like(own.inverse_depth)
     for other, (agrees, _) in said.items():
-        by_chance = torch.zeros_like(agrees)
-        confirmed = torch.zeros_like(agrees)
-        for k in views_between(cameras, index, other):
-            if k in said:
-                confirmed |= said[k][0]
-                by_chance |= said[k][1]
-        votes += agrees & (confirmed | ~by_chance)
+        confirmed, denied = torch.zeros_like(agrees), torch.zeros_like(agrees)
+        for between in views_between(cameras, index, other):
+            if between in said:
+                confirmed |= said[between][0]
+                denied |= said[between][1]
+        votes += agrees & (confirmed | ~denied)
     good = own.window.subject & (own.score > config.min_correlation) & (points.norm(dim=-1) < 1.0)
     return torch.where(good & (votes > 1), votes, 0.0)
 

@@ -94,19 +94,39 @@ def test_a_rehearsal_gets_its_length_and_end(monkeypatch: pytest.MonkeyPatch) ->
     ]
 
 
+SLEEP, SPIN, SHORTLY = (
+    {"OMP_WAIT_POLICY": "PASSIVE"},
+    {"OMP_WAIT_POLICY": "ACTIVE"},
+    {"GOMP_SPINCOUNT": "10000"},
+)
+AT_LENGTH = {"GOMP_SPINCOUNT": "500000"}
+
+
 @pytest.mark.parametrize(
     ("running", "chosen", "expected"),
-    [(1, None, None), (9, None, "PASSIVE"), (9, "ACTIVE", "ACTIVE"), (1, "PASSIVE", "PASSIVE")],
+    [
+        (1, {}, SHORTLY),
+        (9, {}, SLEEP),
+        (9, SPIN, SPIN),
+        (1, SLEEP, SLEEP),
+        (1, AT_LENGTH, AT_LENGTH),
+        (9, AT_LENGTH, AT_LENGTH),
+    ],
 )
-def test_threads_that_wait_sleep_where_the_computer_is_busy(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, running: int, chosen: str | None, expected: str | None
+def test_threads_that_wait_leave_the_cores_to_others(
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+    running: int,
+    chosen: dict[str, str],
+    expected: dict[str, str],
 ) -> None:
+    """At once where the computer is busy, else soon; but as the user says if he does."""
     load = tmp_path / "loadavg"
     load.write_text(f"5.00 5.00 5.00 {running}/250 4711\n", encoding="ascii")
-    environment = {} if chosen is None else {"OMP_WAIT_POLICY": chosen}
+    environment = dict(chosen)
     monkeypatch.setattr(waiting, "_LOAD", load)
     monkeypatch.setattr(os, "environ", environment)
     monkeypatch.setattr(os, "cpu_count", lambda: 4)
     monkeypatch.setattr(program, "run", lambda _arguments: 0)
     program.main([])
-    assert environment.get("OMP_WAIT_POLICY") == expected
+    assert environment == expected
