@@ -12,10 +12,10 @@ _SAMPLES, _APART_S = 5, 0.01
 def set_waiting_policy() -> None:
     """Let threads spin only for a short while before they sleep, or not at all on a busy computer.
 
-    Unless the user has chosen. By default they spin for 300 000 rounds: as soon as somebody else wants a core,
-    as Blender does while its user goes on working, they keep each other from the rest (a fit of 21 s took
-    129 s). With 10 000 rounds it took 32 s, with none 20 s; alone, 10 000 are as fast as the default, and
-    none takes up to 1.7 times as long. Only Linux is asked: elsewhere nothing was measured.
+    Unless the user has chosen. By default they spin for 300 000 rounds: as soon as somebody else wants a
+    core, as Blender does while its user goes on working, they keep each other from the rest (a fit of 21 s
+    took 129 s). With 10 000 rounds it took 32 s, with none 20 s. Alone, 10 000 are as fast as the default,
+    and none takes up to 1.7 times as long. Only Linux is asked: elsewhere nothing was measured.
     """
     if {"OMP_WAIT_POLICY", "GOMP_SPINCOUNT"} & set(os.environ) or not _LOAD.exists():
         return
