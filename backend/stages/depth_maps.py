@@ -92,7 +92,7 @@ def depth_maps(
         rounds = config.growth_rounds[min(level, 2)]
         maps = _grown_together(maps, sources, nearby, rounds, config, within(tell, 0.3, 1.0))
         sharp = [_refined(m, near, [0.25, 0.125], config) for m, near in zip(maps, sources, strict=True)]
-        votes = [_agreement(index, sharp, nearby, config) for index in range(len(sharp))]
+        votes = [_votes(index, sharp, nearby, config) for index in range(len(sharp))]
         by_size.insert(0, [_measured(*one, config) for one in zip(sharp, votes, sources, strict=True)])
     return [_each_once(list(sizes)) for sizes in zip(*by_size, strict=True)]
 
@@ -120,7 +120,7 @@ def _grown_together(
 ) -> list[Map]:
     """Rounds of growth over all views."""
     for round_ in range(rounds):
-        votes = [_agreement(index, maps, nearby, config) for index in range(len(maps))]
+        votes = [_votes(index, maps, nearby, config) for index in range(len(maps))]
         for index, near in enumerate(sources):
             progress((round_ + index / len(maps)) / rounds, f"depth of photograph {index + 1}")
             if near:
@@ -143,15 +143,14 @@ def _grown(
     radius = config.patch_radius + 1
     planes = fit_planes(current.inverse_depth, seeds * current.score.clamp(min=0) ** 2, radius)
     known = window_sum(seeds.float(), radius) >= _LEAST_FOR_A_PLANE
-    planes_beside = []
-    shifts = ((0, 0), (reach, 0), (-reach, 0), (0, reach), (0, -reach))
-    for du, dv in shifts:
+    planes_beside, known_beside = [], []
+    for du, dv in ((0, 0), (reach, 0), (-reach, 0), (0, reach), (0, -reach)):
         value, slope_u, slope_v = _moved(planes, du, dv)
         continued = (value - du * slope_u - dv * slope_v).clamp(far, near)
-        planes_beside.append(torch.where(_moved(known, du, dv), continued, current.inverse_depth))
+        known_beside.append(_moved(known, du, dv))
+        planes_beside.append(torch.where(known_beside[-1], continued, current.inverse_depth))
     hypotheses = torch.stack(planes_beside)
-    beside = torch.stack([_moved(known, *shift) for shift in shifts]).any(dim=0)
-    asked = window.subject & beside & ~seeds
+    asked = window.subject & torch.stack(known_beside).any(dim=0) & ~seeds
     score, index = agreement(window, sources, hypotheses, asked).max(dim=0)
     better = asked & (score > current.score)
     chosen = hypotheses.gather(0, index[None])[0]
@@ -300,7 +299,7 @@ def _measured(
     )
 
 
-def _agreement(
+def _votes(
     index: int, maps: list[Map], nearby: list[list[int]], config: StereoConfig
 ) -> Float[Tensor, "height width"]:
     """How many views agree with each pixel's depth (itself counted), 0 where it is not a measurement.
