@@ -4,6 +4,7 @@ import importlib
 import json
 import platform
 import sys
+import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from importlib.metadata import PackageNotFoundError, version
@@ -20,6 +21,7 @@ DEPENDENCIES = {
     "scipy": "scipy",
     "skimage": "scikit-image",
     "torch": "torch",
+    "numba": "numba",
     "pycolmap": "pycolmap",
     "trimesh": "trimesh",
     "embreex": "embreex",
@@ -49,6 +51,7 @@ def examine() -> Iterator[Check]:
         checks.append(_check_package(module, distribution))
         yield checks[-1]
     if is_ready(checks):
+        yield _check_compiler()
         yield from _check_devices()
 
 
@@ -102,6 +105,17 @@ def _check_package(module: str, distribution: str) -> Check:
         return Check(name=distribution, fine=True, found=version(distribution))
     except PackageNotFoundError:
         return Check(name=distribution, fine=True, found="version unknown")
+
+
+def _check_compiler() -> Check:
+    """Fine if what is compiled finds an image equal to itself; compiled code is kept for later runs."""
+    from .kernels.patch_correlation import error_of_an_image_with_itself
+
+    started = time.perf_counter()
+    error = error_of_an_image_with_itself()
+    seconds = time.perf_counter() - started
+    wrong = "" if error < 1e-5 else f", but computes wrongly (error {error:.2g})"
+    return Check(name="compiled code", fine=not wrong, found=f"ready after {seconds:.1f} s{wrong}")
 
 
 def _check_devices() -> Iterator[Check]:

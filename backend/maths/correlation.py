@@ -64,17 +64,6 @@ class PatchStatistics:
     variance: Float[Tensor, "height width"]
     radius: int
 
-    def part(self, rows: slice, columns: slice) -> "PatchStatistics":
-        """Of some pixels; patches at its borders are cut there."""
-        return PatchStatistics(
-            image=self.image[rows, columns],
-            subject=self.subject[rows, columns],
-            count=self.count[rows, columns],
-            mean=self.mean[rows, columns],
-            variance=self.variance[rows, columns],
-            radius=self.radius,
-        )
-
 
 def patch_statistics(
     image: Float[Tensor, "height width"], subject: Float[Tensor, "height width"], radius: int

@@ -1,20 +1,23 @@
 """How well the patches of a view agree with other views, at depths to be tried."""
 
 from collections.abc import Iterator
-from itertools import repeat
+from concurrent.futures import ThreadPoolExecutor
+from functools import cache
 
+import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Float32
 from torch import Tensor
 
+from ..kernels.patch_correlation import correlate, soft_maximum
 from ..maths.correlation import correlation
 from ..maths.geometry import epipolar_map, inside, pixel_centres, sample_image, warp_pixels
 from .stereo_windows import Window
 
-_AT_ONCE = 2**18
-"""Values compared at once on the CPU: few enough for its caches."""
 _SELECTIVITY = 0.15
 """Temperature of the soft maximum over sources."""
+_TILE = (64, 128)
+"""Rows and columns that a thread compares at a time: few enough for a core's cache."""
 
 
 def agreement(
@@ -28,46 +31,77 @@ def agreement(
     A soft maximum over sources: where one of them is hidden behind something, the others decide. Other
     pixels get -1, or, where it costs nothing, what they would get if they were asked.
     """
+    on_cpu = inverse_depth.device.type == "cpu"
+    return (_compiled if on_cpu else in_torch)(window, sources, inverse_depth, asked)
+
+
+def in_torch(
+    window: Window,
+    sources: list[Window],
+    inverse_depth: Float[Tensor, "planes height width"],
+    asked: Bool[Tensor, "height width"],
+) -> Float[Tensor, "planes height width"]:
+    """`agreement` on any device; on the CPU the reference for what is compiled."""
     pixels = pixel_centres(window.camera.width, window.camera.height, window.grey.device)
-    scores = torch.full_like(inverse_depth, -1.0)
-    for piece in _pieces(asked, len(inverse_depth)):
-        around = tuple(map(_widened, piece, asked.shape, repeat(window.patches.radius)))
-        patches = window.patches.part(*around)
-        per_source = []
-        for source in sources:
-            a, b = epipolar_map(source.camera, window.camera)
-            where = warp_pixels(a, b, pixels[around], inverse_depth[:, *around])
-            warped = sample_image(source.grey[None], where)[:, 0]
-            score = correlation(patches, warped, max(window.noise, source.noise))
-            seen = inside(where, source.camera.width, source.camera.height)
-            per_source.append(torch.where(seen, score, -1.0))
-        inner = tuple(
-            slice(part.start - wide.start, part.stop - wide.start)
-            for part, wide in zip(piece, around, strict=True)
-        )
-        scores[:, *piece] = _soft_maximum(per_source)[:, *inner]
-    return scores
+    per_source = []
+    for source in sources:
+        a, b = epipolar_map(source.camera, window.camera)
+        where = warp_pixels(a, b, pixels, inverse_depth)
+        warped = sample_image(source.grey[None], where)[:, 0]
+        score = correlation(window.patches, warped, max(window.noise, source.noise))
+        seen = inside(where, source.camera.width, source.camera.height)
+        per_source.append(torch.where(seen, score, -1.0))
+    stacked = torch.stack(per_source)
+    return torch.where(asked, (stacked * torch.softmax(stacked / _SELECTIVITY, dim=0)).sum(dim=0), -1.0)
 
 
-def _soft_maximum(scores: list[Float[Tensor, "planes height width"]]) -> Float[Tensor, "planes height width"]:
-    if len(scores) == 1:
-        return scores[0]
-    stacked = torch.stack(scores)
-    return (stacked * torch.softmax(stacked / _SELECTIVITY, dim=0)).sum(dim=0)
+def _compiled(
+    window: Window,
+    sources: list[Window],
+    inverse_depth: Float[Tensor, "planes height width"],
+    asked: Bool[Tensor, "height width"],
+) -> Float[Tensor, "planes height width"]:
+    """`agreement` on the CPU, tiles side by side."""
+    of = window.patches
+    patches = (_numpy(of.image), _numpy(of.subject), _numpy(of.count), _numpy(of.mean), _numpy(of.variance))
+    compared = []
+    for source in sources:
+        a, b = epipolar_map(source.camera, window.camera)
+        floor = np.float32(max(window.noise, source.noise) ** 2)
+        compared.append((_numpy(source.grey), (_numpy(a), _numpy(b)), floor))
+    depths = _numpy(inverse_depth)
+    scores = np.full(depths.shape, -1, np.float32)
+
+    def compare(tile: tuple[int, int, int, int]) -> None:
+        top, bottom, left, right = tile
+        per_source = np.empty((len(sources), len(depths), bottom - top, right - left), np.float32)
+        for (grey, epipolar, floor), found in zip(compared, per_source, strict=True):
+            correlate(tile, of.radius, patches, grey, epipolar, floor, depths, found)
+        soft_maximum(per_source, np.float32(_SELECTIVITY))
+        scores[:, top:bottom, left:right] = per_source[0]
+
+    for _ in _threads(torch.get_num_threads()).map(compare, _tiles(asked)):
+        pass
+    return torch.from_numpy(scores)
 
 
-def _pieces(asked: Bool[Tensor, "height width"], num_planes: int) -> Iterator[tuple[slice, slice]]:
-    """Rows and columns around what is asked, band by band: a band's numbers fit a processor's caches."""
+def _numpy(values: Float[Tensor, "*shape"]) -> Float32[np.ndarray, "*shape"]:
+    """Without gaps in memory."""
+    return values.to(torch.float32).contiguous().numpy()
+
+
+@cache
+def _threads(count: int) -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(count, thread_name_prefix="agreement")
+
+
+def _tiles(asked: Bool[Tensor, "height width"]) -> Iterator[tuple[int, int, int, int]]:
+    """(top, bottom, left, right) around what is asked in each tile of the image."""
     height, width = asked.shape
-    # elsewhere than on the CPU many small pieces only wait for each other
-    rows = max(_AT_ONCE // (num_planes * width), 1) if asked.device.type == "cpu" else height
-    for top in range(0, height, rows):
-        band = slice(top, min(top + rows, height))
-        columns = torch.nonzero(asked[band].any(dim=0))
-        if len(columns):
-            yield band, slice(int(columns[0]), int(columns[-1]) + 1)
-
-
-def _widened(part: slice, size: int, radius: int) -> slice:
-    """The same and what patches reach on either side."""
-    return slice(max(part.start - radius, 0), min(part.stop + radius, size))
+    for top in range(0, height, _TILE[0]):
+        for left in range(0, width, _TILE[1]):
+            part = asked[top : top + _TILE[0], left : left + _TILE[1]].numpy()
+            rows, columns = np.flatnonzero(part.any(axis=1)), np.flatnonzero(part.any(axis=0))
+            if len(rows):
+                first, last = top + int(rows[0]), top + int(rows[-1])
+                yield first, last + 1, left + int(columns[0]), left + int(columns[-1]) + 1
