@@ -125,9 +125,8 @@ def match_speed_px(
 ) -> Float[Tensor, "height width"]:
     """Pixels by which what `warp_pixels` gives moves in the source, per unit of inverse depth."""
     base, denominator = _in_source(a, b, pixels, inverse_depth)
-    across = base[..., 2:] * b[:2] - base[..., :2] * b[2]
-    speed: Tensor = across.norm(dim=-1) / denominator.square()
-    return speed
+    x, y, z = base.unbind(dim=-1)
+    return torch.hypot(z * b[0] - x * b[2], z * b[1] - y * b[2]) / denominator.square()
 
 
 def _in_source(

@@ -347,7 +347,7 @@ def _judged(
     found &= score > config.min_correlation - 0.1
     there = unproject(other.window.camera, seen_at, 1 / inverse_depth.clamp(min=1e-6))
     back_at, back_depth = project(own.window.camera, there)
-    moved = (back_at - pixels).norm(dim=-1)
+    moved = torch.hypot(*(back_at - pixels).unbind(dim=-1))
     step = 1 / own.inverse_depth.clamp(min=1e-6)
     relative = (back_depth - step).abs() / step
     same = (moved < config.max_reprojection_px) & (relative < 0.01)
