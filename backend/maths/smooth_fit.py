@@ -5,9 +5,12 @@ linear (Calakli and Taubin, "SSD: smooth signed distance surface reconstruction"
 simplest discrete form): solved by conjugate gradients, to start from a coarser grid's solution.
 """
 
-from jaxtyping import Float
+import numpy as np
+import torch
+from jaxtyping import Float, Float32
 from torch import Tensor
 
+from ..kernels import bending
 from .conjugate_gradients import conjugate_gradients
 from .grid import laplacian
 
@@ -21,9 +24,36 @@ def fit_smooth(
     steps: int,
 ) -> Float[Tensor, "nodes nodes nodes"]:
     """`steps` of conjugate gradients with the diagonal as preconditioner, from `start`."""
-    diagonal = weight + smoothness * 42.0  # 6^2 + 6: the biharmonic stencil's middle
+    if weight.device.type == "cpu" and weight.dtype == torch.float32:
+        solution = bending.conjugate_gradients(
+            _numpy(weight),
+            smoothness,
+            _numpy(weight * target),
+            _numpy(start),
+            steps=steps,
+            threads=torch.get_num_threads(),
+        )
+        return torch.from_numpy(solution)
+    return in_torch(target, weight, start, smoothness=smoothness, steps=steps)
+
+
+def in_torch(
+    target: Float[Tensor, "nodes nodes nodes"],
+    weight: Float[Tensor, "nodes nodes nodes"],
+    start: Float[Tensor, "nodes nodes nodes"],
+    *,
+    smoothness: float,
+    steps: int,
+) -> Float[Tensor, "nodes nodes nodes"]:
+    """`fit_smooth` on any device and in any precision; the reference for what is compiled."""
+    diagonal = weight + smoothness * bending.DIAGONAL
 
     def apply(f: Tensor) -> Tensor:
         return weight * f + smoothness * laplacian(laplacian(f))
 
     return conjugate_gradients(apply, diagonal, weight * target, start, steps=steps)
+
+
+def _numpy(values: Float[Tensor, "*shape"]) -> Float32[np.ndarray, "*shape"]:
+    """Without gaps in memory."""
+    return values.contiguous().numpy()

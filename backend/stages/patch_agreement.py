@@ -1,8 +1,6 @@
 """How well the patches of a view agree with other views, at depths to be tried."""
 
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
-from functools import cache
 
 import numpy as np
 import torch
@@ -10,6 +8,7 @@ from jaxtyping import Bool, Float, Float32
 from torch import Tensor
 
 from ..kernels.patch_correlation import correlate, soft_maximum
+from ..kernels.side_by_side import side_by_side
 from ..maths.correlation import correlation
 from ..maths.geometry import epipolar_map, inside, pixel_centres, sample_image, warp_pixels
 from .stereo_windows import Window
@@ -80,19 +79,13 @@ def _compiled(
         soft_maximum(per_source, np.float32(_SELECTIVITY))
         scores[:, top:bottom, left:right] = per_source[0]
 
-    for _ in _threads(torch.get_num_threads()).map(compare, _tiles(asked)):
-        pass
+    side_by_side(compare, _tiles(asked), torch.get_num_threads())
     return torch.from_numpy(scores)
 
 
 def _numpy(values: Float[Tensor, "*shape"]) -> Float32[np.ndarray, "*shape"]:
     """Without gaps in memory."""
     return values.to(torch.float32).contiguous().numpy()
-
-
-@cache
-def _threads(count: int) -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(count, thread_name_prefix="agreement")
 
 
 def _tiles(asked: Bool[Tensor, "height width"]) -> Iterator[tuple[int, int, int, int]]:

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from backend.maths.grid import laplacian
-from backend.maths.smooth_fit import fit_smooth
+from backend.maths.smooth_fit import fit_smooth, in_torch
 
 NODES = 5
 
@@ -40,13 +40,30 @@ def energy(f: Tensor, smoothness: float) -> float:
 
 
 @pytest.mark.parametrize("smoothness", [0.01, 1.0])
-def test_matches_a_dense_solve(smoothness: float) -> None:
+@pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float64, 1e-6), (torch.float32, 1e-4)])
+def test_matches_a_dense_solve(smoothness: float, dtype: torch.dtype, tolerance: float) -> None:
     target, weight = measurements()
     bending = dense_laplacian()
     matrix = np.diag(weight.flatten().numpy()) + smoothness * bending.T @ bending
     expected = np.linalg.solve(matrix, (weight * target).flatten().numpy()).reshape((NODES,) * 3)
-    found = fit_smooth(target, weight, torch.zeros_like(target), smoothness=smoothness, steps=300)
-    torch.testing.assert_close(found, torch.tensor(expected), atol=1e-6, rtol=0)
+    given = target.to(dtype), weight.to(dtype), torch.zeros_like(target, dtype=dtype)
+    found = fit_smooth(*given, smoothness=smoothness, steps=300)
+    assert found.dtype == dtype
+    torch.testing.assert_close(found.double(), torch.tensor(expected), atol=tolerance, rtol=0)
+
+
+@pytest.mark.parametrize(("nodes", "threads"), [(2, 1), (3, 1), (33, 3), (70, 1), (70, 3)])
+def test_compiled_as_in_torch(nodes: int, threads: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Single precision, compiled, beside double precision in torch."""
+    generator = torch.Generator().manual_seed(1)
+    target, start = torch.randn((2, nodes, nodes, nodes), generator=generator)
+    weight = 0.01 + torch.rand((nodes, nodes, nodes), generator=generator) ** 8
+    monkeypatch.setattr(torch, "get_num_threads", lambda: threads)
+    kept = start.clone()
+    found = fit_smooth(target, weight, start, smoothness=0.1, steps=12)
+    reference = in_torch(target.double(), weight.double(), start.double(), smoothness=0.1, steps=12)
+    torch.testing.assert_close(found.double(), reference, atol=2e-4, rtol=0)
+    assert (start == kept).all()
 
 
 def test_more_steps_lower_the_energy() -> None:
