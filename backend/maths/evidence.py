@@ -12,8 +12,8 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from .geometry import Pinhole, inside, project, sample_image
-from .grid import node_positions, spacing
+from .geometry import Pinhole, inside, sample_image
+from .grid import node_steps, spacing
 
 _BATCH = 8192
 """Points whose distances to all nodes around them are computed at once: few enough for a core's cache."""
@@ -112,11 +112,27 @@ def read_at_nodes(
     Float[Tensor, "nodes nodes nodes"], Float[Tensor, "nodes nodes nodes"], Bool[Tensor, "nodes nodes nodes"]
 ]:
     """What an image holds where it shows each node, each node's depth, and whether it is shown at all."""
-    points = node_positions(nodes, image.device)
-    pixel, depth = project(camera, points)
+    pixel, depth = _project_nodes(camera, nodes)
     shown = inside(pixel, camera.width, camera.height) & (depth > 0)
     flat = pixel.reshape(nodes, nodes * nodes, 2)
     return sample_image(image[None], flat[None], mode=mode)[0, 0].reshape(shown.shape), depth, shown
+
+
+def _project_nodes(
+    camera: Pinhole, nodes: int
+) -> tuple[Float[Tensor, "nodes nodes nodes 2"], Float[Tensor, "nodes nodes nodes"]]:
+    """`project` of all nodes: homogeneous coordinates are sums of what each axis adds to them."""
+    matrix = camera.intrinsics @ camera.camera_from_object[:3]
+    steps = node_steps(nodes, matrix.device)
+    x, y, depth = (
+        (row[0] * steps)[:, None, None] + (row[1] * steps)[:, None] + (row[2] * steps + row[3])
+        for row in matrix
+    )
+    divisor = torch.where(depth > 0, depth, 1.0)
+    pixel = torch.empty((*depth.shape, 2), device=depth.device)
+    torch.div(x, divisor, out=pixel[..., 0])
+    torch.div(y, divisor, out=pixel[..., 1])
+    return pixel, depth
 
 
 def off_silhouette(

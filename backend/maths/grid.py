@@ -32,9 +32,14 @@ def spacing(nodes: int) -> float:
     return 2.0 / (nodes - 1)
 
 
+def node_steps(nodes: int, device: torch.device) -> Float[Tensor, "nodes"]:
+    """Where the nodes lie along each axis."""
+    return torch.linspace(-1, 1, nodes, device=device)
+
+
 def node_positions(nodes: int, device: torch.device) -> Float[Tensor, "nodes nodes nodes 3"]:
     """Where the nodes lie."""
-    steps = torch.linspace(-1, 1, nodes, device=device)
+    steps = node_steps(nodes, device)
     return torch.stack(torch.meshgrid(steps, steps, steps, indexing="ij"), dim=-1)
 
 
