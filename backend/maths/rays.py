@@ -7,6 +7,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+_TOGETHER = 8
+"""Steps of all rays before those that are done are left out."""
 DistanceFunction = Callable[[Float[Tensor, "points 3"]], Float[Tensor, "points"]]
 
 
@@ -63,18 +65,42 @@ def first_crossing(
     A ray that never meets the surface gets the place where it came nearest, so that the silhouette
     can be moved towards or away from it. Rays end `reach` after their start.
     """
-    along = start.clone()
-    before_along, before = along, torch.full_like(along, torch.inf)
-    nearest, nearest_along = torch.full_like(along, torch.inf), along.clone()
-    crossing, hit = along.clone(), torch.zeros_like(along, dtype=torch.bool)
-    for _ in range(steps):
-        here = distance(origins + along[:, None] * directions)
-        closer = (here < nearest) & ~hit
-        nearest, nearest_along = torch.where(closer, here, nearest), torch.where(closer, along, nearest_along)
-        new = (here <= 0) & ~hit
-        share = torch.where(before.isfinite(), before / (before - here).clamp(min=1e-9), 1.0)
-        crossing = torch.where(new, before_along + share * (along - before_along), crossing)
-        hit = hit | new
-        before_along, before = along, here
-        along = (along + (0.95 * here).clamp(shortest, longest)).minimum(start + reach)
-    return Crossing(along=torch.where(hit, crossing, nearest_along), hit=hit)
+    place, hit = start.clone(), torch.zeros_like(start, dtype=torch.bool)
+    number, end, infinite = torch.arange(len(start), device=start.device), start + reach, start + torch.inf
+    going = [number, origins, directions, end, start, start, infinite, infinite, place, hit]
+    for first in range(0, steps, _TOGETHER):
+        for _ in range(first, min(first + _TOGETHER, steps)):
+            going[4:] = _traced(distance, shortest, longest, *going[1:])
+        number, _, _, end, _, last, _, _, at, met = going
+        place[number], hit[number] = at, met
+        left = ~met & (last < end)
+        going = [state[left] for state in going]
+    return Crossing(along=place, hit=hit)
+
+
+def _traced(
+    distance: DistanceFunction,
+    shortest: float,
+    longest: float,
+    origins: Float[Tensor, "rays 3"],
+    directions: Float[Tensor, "rays 3"],
+    end: Float[Tensor, "rays"],
+    along: Float[Tensor, "rays"],
+    last: Float[Tensor, "rays"],
+    before: Float[Tensor, "rays"],
+    nearest: Float[Tensor, "rays"],
+    at: Float[Tensor, "rays"],
+    met: Bool[Tensor, "rays"],
+) -> list[Tensor]:
+    """One step of rays that are at `along`: the same of what changes, from `along` to `met`.
+
+    `last` is the place before, `before` the distance there, `at` where a ray met the surface or was nearest.
+    """
+    here = distance(origins + along[:, None] * directions)
+    closer = (here < nearest) & ~met
+    nearest, at = torch.where(closer, here, nearest), torch.where(closer, along, at)
+    new = (here <= 0) & ~met
+    share = torch.where(before.isfinite(), before / (before - here).clamp(min=1e-9), 1.0)
+    at = torch.where(new, last + share * (along - last), at)
+    further = (along + (0.95 * here).clamp(shortest, longest)).minimum(end)
+    return [further, along, here, nearest, at, met | new]
