@@ -19,7 +19,7 @@ PART, OLD, LOCK = ".part", ".old", ".lock"
 CONSTRAINTS = "constraints.txt"
 BUILDS = ("default", "cpu", "cuda")
 """Builds of torch: what the package index offers for this system, the smallest, the one for NVIDIA's GPUs."""
-_SMALL_GB, _CUDA_GB = (0.5, 1.5), (3.1, 7.0)
+_SMALL_GB, _CUDA_GB = (0.6, 1.7), (3.2, 7.2)
 """To fetch, and on the disk when finished. Measured on Linux without CUDA; with CUDA an estimate."""
 _WHILE_INSTALLING = 1.6
 """Disk that is needed, over the size of the finished environment: downloads are kept beside it."""
