@@ -22,6 +22,8 @@ from backend.scene import Camera, Lens, Region, SolvedCameras, View
 CENTRE = np.array([0.7, -0.4, 1.1])
 SIZE = 2.5
 """World units; the body reaches 1.1 times that from its centre."""
+OBJECT_UNIT = 1.2 * SIZE
+"""Of the true region's object frame, in world units."""
 DISTANCE = 4.0
 """Of the cameras from the centre, in SIZE."""
 
@@ -147,8 +149,8 @@ def diagonal() -> float:
 def true_region() -> Region:
     """A sphere around the body with a tenth of room."""
     object_from_world = np.eye(4)
-    object_from_world[:3, :3] /= 1.2 * SIZE
-    object_from_world[:3, 3] = -CENTRE / (1.2 * SIZE)
+    object_from_world[:3, :3] /= OBJECT_UNIT
+    object_from_world[:3, 3] = -CENTRE / OBJECT_UNIT
     return Region(object_from_world=object_from_world)
 
 

@@ -3,11 +3,13 @@
 import math
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 import torch.nn.functional as F
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Float64
 from torch import Tensor
 
+from ..maths.angles import angles_between
 from ..maths.backdrop import find_backdrop
 from ..maths.correlation import PatchStatistics, patch_statistics, without_local_mean
 from ..maths.geometry import Pinhole, pinhole_in_object, pixel_centres, unproject
@@ -135,10 +137,11 @@ def views_between(cameras: list[Pinhole], one: int, other: int) -> list[int]:
     ]
 
 
-def _angles_deg(cameras: list[Pinhole]) -> Float[Tensor, "views views"]:
+def _angles_deg(cameras: list[Pinhole]) -> Float64[np.ndarray, "views views"]:
     """Between the views, seen from the middle of the region."""
     directions = F.normalize(torch.stack([camera.position for camera in cameras]), dim=-1)
-    return torch.rad2deg(torch.arccos((directions @ directions.T).clamp(-1, 1)))
+    unit = directions.cpu().numpy().astype(np.float64)
+    return np.asarray(np.degrees(angles_between(unit[:, None], unit[None])))
 
 
 def _pair_cost(angle_deg: float) -> float:

@@ -19,10 +19,10 @@ from backend.stages.camera_report import (
     camera_report_numbers,
     point_angles_deg,
 )
-from tests.synthetic_scene import SIZE, arc_cameras, photographed, surface_points, true_region
+from tests.synthetic_scene import OBJECT_UNIT, arc_cameras, photographed, surface_points, true_region
 
 LOST = "lost <1>.png"
-DIAMETER = 2 * 1.2 * SIZE
+DIAMETER = 2 * OBJECT_UNIT
 
 
 @cache

@@ -27,6 +27,7 @@ from backend.stages.stereo import DepthMap, StereoResult
 from backend.stages.train import Surface
 from tests.synthetic_scene import (
     CENTRE,
+    OBJECT_UNIT,
     SIZE,
     Scene,
     arc_cameras,
@@ -41,7 +42,7 @@ from tests.synthetic_scene import (
 
 GRID_FROM_WORLD = true_region().object_from_world
 NODES = 48
-CELL = 1.2 * SIZE * 2 / (NODES - 1)
+CELL = OBJECT_UNIT * 2 / (NODES - 1)
 """World units."""
 
 
@@ -54,7 +55,7 @@ def node_positions(nodes: int = NODES) -> np.ndarray:
 
 def surface_of(distance_world: np.ndarray) -> Surface:
     nodes = round(len(distance_world) ** (1 / 3))
-    values = (distance_world / (1.2 * SIZE)).astype(np.float32).reshape((nodes,) * 3)
+    values = (distance_world / OBJECT_UNIT).astype(np.float32).reshape((nodes,) * 3)
     return Surface(distance=values, grid_from_world=GRID_FROM_WORLD)
 
 

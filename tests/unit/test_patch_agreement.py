@@ -13,10 +13,7 @@ from backend.stages import patch_agreement
 from backend.stages.patch_agreement import agreement, in_torch
 from backend.stages.stereo_config import StereoConfig
 from backend.stages.stereo_windows import Window, pyramid
-from tests.synthetic_scene import SIZE, Scene, arc_cameras, photographed, true_region
-
-OBJECT_UNIT = 1.2 * SIZE
-"""Of the region's object frame, in world units."""
+from tests.synthetic_scene import OBJECT_UNIT, Scene, arc_cameras, photographed, true_region
 
 
 @pytest.fixture(scope="module")

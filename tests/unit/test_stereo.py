@@ -17,6 +17,7 @@ from backend.stages.stereo_config import StereoConfig
 from backend.stages.stereo_windows import views_between
 from tests.synthetic_scene import (
     CENTRE,
+    OBJECT_UNIT,
     SIZE,
     Scene,
     arc_cameras,
@@ -28,8 +29,6 @@ from tests.synthetic_scene import (
     true_region,
 )
 
-OBJECT_UNIT = 1.2 * SIZE
-"""Of the region's object frame, in world units."""
 PLATE = CENTRE - [0, 0.8 * SIZE, 0]
 """The middle of a square across y, nearer to the cameras than the body."""
 
