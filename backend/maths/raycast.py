@@ -14,8 +14,9 @@ from embreex.rtcore_scene import EmbreeScene
 from jaxtyping import Bool, Float, Float32, Float64, Int, Int64
 
 from ..scene import Camera, SurfaceMesh
-from .projection import in_picture
+from .projection import in_picture, projected
 
+EVERYTHING = slice(None)
 GRAZING_COSINE = 0.05
 """A surface seen at a smaller cosine (87 degrees off its normal) shows too few pixels to count as seen."""
 
@@ -141,11 +142,11 @@ def cast_rays(
 
 
 def camera_rays(
-    camera: Camera,
+    camera: Camera, rows: slice = EVERYTHING, columns: slice = EVERYTHING
 ) -> tuple[Float64[np.ndarray, "pixels 3"], Float64[np.ndarray, "pixels 3"]]:
-    """Origin and unit direction, world frame, through every pixel's centre, row by row."""
-    x = (np.arange(camera.width) + 0.5 - camera.cx_px)[:, None] / camera.fx_px
-    y = (np.arange(camera.height) + 0.5 - camera.cy_px)[:, None, None] / camera.fy_px
+    """Origin and unit direction, world frame, through the centres of all or some pixels, row by row."""
+    x = (np.arange(camera.width)[columns] + 0.5 - camera.cx_px)[:, None] / camera.fx_px
+    y = (np.arange(camera.height)[rows] + 0.5 - camera.cy_px)[:, None, None] / camera.fy_px
     right, down, forward = camera.camera_from_world[:3, :3]
     directions = x * right + (y * down + forward)
     directions /= np.sqrt(1.0 + x * x + y * y)  # their length, because the three are orthonormal
@@ -158,29 +159,43 @@ def render_mesh(mesh: SurfaceMesh, camera: Camera, *, caster: RayCaster | None =
 
     `caster` is one built from this mesh, to draw it from several cameras.
     """
-    origins, directions = camera_rays(camera)
-    hits = (caster or RayCaster(mesh.vertices, mesh.faces)).cast(origins, directions)
+    caster = caster or RayCaster(mesh.vertices, mesh.faces)
+    window = part_that_may_show(caster.vertices, camera)
+    origins, directions = camera_rays(camera, *window)
+    hits = caster.cast(origins, directions)
     hit, shape = hits.hit, (camera.height, camera.width)
+    coverage = np.zeros(shape, bool)
+    coverage[window] = hit.reshape(coverage[window].shape)
     corners, weights = mesh.faces[hits.face[hit]], hits.barycentric[hit]
 
     def picture(
-        values: Float[np.ndarray, "covered *channels"],
+        values: Float[np.ndarray, "covered *channels"], beside: float = 0.0
     ) -> Float32[np.ndarray, "height width *channels"]:
-        image = np.zeros((len(hit), *values.shape[1:]), np.float32)
-        image[hit] = values
-        return image.reshape(*shape, *values.shape[1:])
+        image = np.full((*shape, *values.shape[1:]), beside, np.float32)
+        image[coverage] = values
+        return image
 
     normals = interpolate(mesh.normals, corners, weights)
     lengths = np.linalg.norm(normals, axis=-1, keepdims=True)
-    depth = np.full(len(hit), np.inf, np.float32)
-    depth[hit] = (hits.distance[hit, None] * directions[hit]) @ camera.camera_from_world[2, :3]
+    depth = (hits.distance[hit, None] * directions[hit]) @ camera.camera_from_world[2, :3]
     return MeshImage(
         colour_srgb=picture(interpolate(mesh.colours_srgb, corners, weights) / 255.0),
-        coverage=hit.reshape(shape),
-        depth=depth.reshape(shape),
+        coverage=coverage,
+        depth=picture(depth, beside=np.inf),
         normal_world=picture(normals / np.where(lengths > 0, lengths, 1.0)),
         support=picture(interpolate(mesh.support, corners, weights)),
     )
+
+
+def part_that_may_show(points: Float[np.ndarray, "points 3"], camera: Camera) -> tuple[slice, slice]:
+    """(rows, columns) around what a camera sees of a surface with these corners; all if one is behind it."""
+    pixels, depth = projected(points, camera)
+    if not len(points) or (depth <= 0).any():
+        return EVERYTHING, EVERYTHING
+    first, last = np.floor(pixels.min(axis=0)), np.ceil(pixels.max(axis=0)) + 1
+    size = [camera.width, camera.height]
+    (left, top), (right, bottom) = np.clip([first, last], 0, size).astype(int)
+    return slice(top, bottom), slice(left, right)
 
 
 def interpolate(

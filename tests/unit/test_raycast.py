@@ -183,6 +183,27 @@ def test_a_rendered_sphere_is_the_analytic_one() -> None:
     assert not image.colour_srgb[~image.coverage].any()
 
 
+@pytest.mark.parametrize(
+    ("distance", "aside", "covers"),
+    [(4.0, 0.0, "some"), (4.0, 1.5, "some"), (0.2, 0.0, "all"), (4.0, 20.0, "none")],
+)
+def test_a_picture_shows_what_the_rays_of_all_its_pixels_meet(
+    distance: float, aside: float, covers: str
+) -> None:
+    """From afar, with the ball over the edge, from within, and with it out of the picture."""
+    mesh = sphere_mesh(4)
+    camera = camera_at(np.array([0.0, -distance, 0.0]))
+    moved = camera.camera_from_world.copy()
+    moved[0, 3] += aside
+    camera = replace(camera, camera_from_world=moved)
+    image = render_mesh(mesh, camera)
+    hits = RayCaster(mesh.vertices, mesh.faces).cast(*camera_rays(camera))
+    np.testing.assert_array_equal(image.coverage.ravel(), hits.hit)
+    assert {"none": not hits.hit.any(), "all": hits.hit.all(), "some": 0 < hits.hit.mean() < 1}[covers]
+    along = camera_rays(camera)[1] @ camera.camera_from_world[2, :3]
+    np.testing.assert_allclose(image.depth.ravel(), hits.distance * along, rtol=1e-6)
+
+
 def test_a_coarse_white_mesh_is_white_and_its_interpolated_normals_are_unit() -> None:
     mesh = sphere_mesh(1)
     white = replace(mesh, colours_srgb=np.full_like(mesh.colours_srgb, 255))
