@@ -519,7 +519,7 @@ def test_a_small_disk_is_told_before_anything_is_made(
 ) -> None:
     monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=needed_bytes("cpu") - 1))
     folder = tmp_path / "a" / "b"
-    with pytest.raises(ReconstructionError, match=r"the environment needs about 2\.4 GB") as caught:
+    with pytest.raises(ReconstructionError, match=r"the environment needs about 2\.7 GB") as caught:
         folders.check_space(folder, "cpu")
     assert caught.value.code is ErrorCode.DISK_FULL
     # What was begun needs no room any more.
