@@ -102,6 +102,11 @@ def pulled(distance: Tensor, g: Tensor, p_minus_q: Tensor) -> Tensor:
     return (p_minus_q + distance[:, None] * g / g.norm(dim=-1, keepdim=True)).norm(dim=-1)
 
 
+def newton_pulled(distance: Tensor, g: Tensor, p_minus_q: Tensor) -> Tensor:
+    """The same by a Newton step."""
+    return (p_minus_q + distance[:, None] * g / g.square().sum(dim=-1, keepdim=True)).norm(dim=-1)
+
+
 def taylor_error(residual: Callable[[Tensor, Tensor, Tensor], Tensor]) -> float:
     """Of the residual and of its derivative by the gradient, in shares of 1 + |g|."""
     distance, g, p_minus_q = taylor_cases()
@@ -110,6 +115,41 @@ def taylor_error(residual: Callable[[Tensor, Tensor, Tensor], Tensor]) -> float:
     value = residual(distance, g, p_minus_q)
     slope = gradient(lambda x: residual(distance, x, p_minus_q), g)
     return max(largest(value, exact, size), largest(slope, p_minus_q))
+
+
+def pull_error(pull: Callable[[Tensor, Tensor, Tensor], Tensor], least_slope: float, power: int) -> float:
+    """Of |p - q + f g / |g|^power| and of its derivative by f; the derivative by g must be finite.
+
+    A slope below `least_slope` counts as that.
+    """
+    distance, g, p_minus_q = taylor_cases()
+    length = g.double().norm(dim=-1, keepdim=True).clamp(min=least_slope)
+    step = g.double() / length**power
+    exact = p_minus_q + distance.double()[:, None] * step
+    value = pull(distance, g, p_minus_q)
+    slope = gradient(lambda x: pull(x, g, p_minus_q), distance)
+    exact_slope = (exact * step).sum(dim=-1) / exact.norm(dim=-1)
+    by_g = gradient(lambda x: pull(distance, x, p_minus_q), g)
+    size = 1 + step.norm(dim=-1)
+    return max(
+        largest(value, exact.norm(dim=-1), size), largest(slope, exact_slope, size), largest(by_g, by_g)
+    )
+
+
+# log mean exp
+
+
+def log_mean_exp_error(soft_maximum: Callable[[Tensor, float], Tensor]) -> float:
+    """Of losses from 1e-6 to 1e2 at temperatures from 1e-3 to 1e3, in shares of largest and temperature."""
+    generator = torch.Generator().manual_seed(2)
+    draws = 10 ** (8 * torch.rand((7, 500), generator=generator) - 6)
+    worst = 0.0
+    for temperature in (1e-3, 1e-1, 1.0, 10.0, 1e3):
+        scaled = draws.double() / temperature
+        exact = temperature * (torch.logsumexp(scaled, dim=0) - torch.tensor(7.0).double().log())
+        size = draws.double().amax(dim=0) + temperature
+        worst = max(worst, largest(soft_maximum(draws, temperature), exact, size))
+    return worst
 
 
 # curvature
@@ -214,6 +254,27 @@ SWEEPS = (
         usual_formula="pulling by f g / |g|",
         usual=lambda: taylor_error(pulled),
         ours=lambda: taylor_error(losses.taylor_at_query),
+        tolerance=1e-6,
+    ),
+    Sweep(
+        what="Neural-Pull's residual and its derivative, |g| from 0 to 1e4",
+        usual_formula="pulling by f g / |g|",
+        usual=lambda: pull_error(pulled, 1e-6, power=1),
+        ours=lambda: pull_error(losses.pull, 1e-6, power=1),
+        tolerance=1e-6,
+    ),
+    Sweep(
+        what="the same by a Newton step, slopes below 0.1 taken as that",
+        usual_formula="f g / |g|^2",
+        usual=lambda: pull_error(newton_pulled, 0.1, power=2),
+        ours=lambda: pull_error(lambda *x: losses.newton_pull(*x, least_slope=0.1), 0.1, power=2),
+        tolerance=1e-6,
+    ),
+    Sweep(
+        what="soft maximum of losses 1e-6 to 1e2, temperatures 1e-3 to 1e3, in shares of the largest",
+        usual_formula="T log mean exp(loss / T)",
+        usual=lambda: log_mean_exp_error(lambda x, t: t * (x / t).exp().mean(dim=0).log()),
+        ours=lambda: log_mean_exp_error(losses.log_mean_exp),
         tolerance=1e-6,
     ),
     Sweep(
