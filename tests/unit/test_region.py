@@ -179,6 +179,28 @@ def test_what_stands_behind_the_subject_for_one_camera_is_left_out() -> None:
     assert both.radius_world == pytest.approx(alone.radius_world, rel=0.02)
 
 
+def in_a_room(num_subject: int, num_room: int) -> SolvedCameras:
+    """Points on the subject and far behind it, where all of the cameras see them."""
+    behind = CENTRE + np.random.default_rng(4).uniform([-3, 8, -3], [3, 30, 3], (num_room, 3)) * SIZE
+    points = np.vstack([surface_samples(num_subject), behind])
+    return without_images(arc_cameras(3, 20, 80), **sparse(points))
+
+
+def test_a_subject_in_a_room_is_what_all_photographs_have_in_their_middle() -> None:
+    solved = in_a_room(900, 400)
+    region = region_of(solved)
+    np.testing.assert_allclose(region.centre_world, CENTRE, atol=0.01 * SIZE)
+    alone = region_of(without_images([view.camera for view in solved.views]))
+    assert region.radius_world == pytest.approx(alone.radius_world)
+    assert region.decisions[0].choice == "what all photographs have in their middle"
+    assert "60%" in region.decisions[0].because
+
+
+def test_a_room_with_few_points_in_the_middle_is_taken_whole() -> None:
+    region = region_of(in_a_room(200, 600))
+    assert region.radius_world > 5 * SIZE
+
+
 def sparse(points: np.ndarray) -> dict[str, np.ndarray]:
     return {"sparse_positions": points, "sparse_visibility": np.ones((len(points), 3), bool)}
 
