@@ -9,12 +9,10 @@ from collections.abc import Callable, Sequence
 from typing import TypeVar
 
 import numpy as np
-from numba import njit
-from numpy.typing import NDArray
 
+from .compiled import Floats, compiled, summing
 from .side_by_side import side_by_side
 
-Floats = NDArray[np.float32]
 Number = TypeVar("Number")
 
 DIAGONAL = 42.0
@@ -22,13 +20,9 @@ DIAGONAL = 42.0
 ONE = np.uint64(1)
 _TINY = 1e-30
 _LEAST_TO_SHARE = 64
-_rounding_alone = {"contract", "arcp", "nsz"}
-_compiled = njit(cache=True, nogil=True, error_model="numpy", fastmath=_rounding_alone)
-_summing = njit(cache=True, nogil=True, error_model="numpy", fastmath=_rounding_alone | {"reassoc"})
-# sums in any order, so that they are made of vectors
 
 
-@_compiled
+@compiled
 def bend(
     field: Floats, weight: Floats, smoothness: np.float32, first: int, last: int, image: Floats
 ) -> float:
@@ -52,7 +46,7 @@ def bend(
     return product
 
 
-@_compiled
+@compiled
 def laplacian_of_plane(here: Floats, before: Floats, after: Floats, nodes: int, out: Floats) -> None:
     """`backend.maths.grid.laplacian` of a plane between its neighbours; beyond a side stands the node itself.
 
@@ -73,7 +67,7 @@ def laplacian_of_plane(here: Floats, before: Floats, after: Floats, nodes: int, 
             out[end] = along + across + (before[end] - here[end]) + (after[end] - here[end])
 
 
-@_summing
+@summing
 def combine(field: Floats, weight: Floats, smoothness: np.float32, twice: Floats, image: Floats) -> float:
     """Of a plane; the product of plane and image."""
     product = np.float32(0)
@@ -83,7 +77,7 @@ def combine(field: Floats, weight: Floats, smoothness: np.float32, twice: Floats
     return float(product)
 
 
-@_compiled
+@compiled
 def advance(
     solution: Floats, residual: Floats, direction: Floats, image: Floats, diagonal: Floats, step: np.float32
 ) -> float:
@@ -96,7 +90,7 @@ def advance(
     return energy
 
 
-@_summing
+@summing
 def advance_plane(
     solution: Floats, residual: Floats, direction: Floats, image: Floats, diagonal: Floats, step: np.float32
 ) -> float:
@@ -109,14 +103,14 @@ def advance_plane(
     return float(energy)
 
 
-@_compiled
+@compiled
 def turn(direction: Floats, residual: Floats, diagonal: Floats, share: np.float32) -> None:
     """The next direction: the residual over the diagonal, and a share of the last direction."""
     for plane in range(len(direction)):
         turn_plane(direction[plane], residual[plane], diagonal[plane], share)
 
 
-@_compiled
+@compiled
 def turn_plane(direction: Floats, residual: Floats, diagonal: Floats, share: np.float32) -> None:
     for k in range(len(direction)):
         direction[k] = residual[k] / diagonal[k] + share * direction[k]

@@ -7,20 +7,13 @@ instructions. Calls release Python's lock: tiles of an image can be worked on si
 """
 
 import numpy as np
-from numba import njit
-from numpy.typing import NDArray
 
-Floats = NDArray[np.float32]
-Doubles = NDArray[np.float64]
-Ints = NDArray[np.int32]
-
-_compiled = njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "arcp", "nsz"})
-# only what changes a result by rounding: not a number stays what it is
+from .compiled import Doubles, Floats, Ints, compiled
 
 ZERO, HALF, ONE = np.float32(0), np.float32(0.5), np.float32(1)
 
 
-@_compiled
+@compiled
 def correlate(
     tile: tuple[int, int, int, int],
     radius: int,
@@ -85,7 +78,7 @@ def correlate(
                 )
 
 
-@_compiled
+@compiled
 def warp(row: int, first: int, a: Floats, b: Floats, inverse_depth: Floats, x: Floats, y: Floats) -> None:
     """Where the source sees the pixels of a row; outside every image where that is behind it."""
     v = np.float32(row) + HALF
@@ -101,7 +94,7 @@ def warp(row: int, first: int, a: Floats, b: Floats, inverse_depth: Floats, x: F
         y[u] = (ay * column + y_at + inverse_depth[u] * by) * scale if in_front else -ONE
 
 
-@_compiled
+@compiled
 def find(
     x: Floats, y: Floats, width: int, height: int, index: Ints, to_right: Floats, down: Floats, seen: Floats
 ) -> None:
@@ -125,7 +118,7 @@ def find(
         index[u] = j * stride + i
 
 
-@_compiled
+@compiled
 def interpolate(
     flat: Floats, width: int, index: Ints, to_right: Floats, down: Floats, values: Floats
 ) -> None:
@@ -138,7 +131,7 @@ def interpolate(
         values[u] = upper + down[u] * (lower - upper)
 
 
-@_compiled
+@compiled
 def multiply(warped: Floats, subject: Floats, image: Floats, products: Floats) -> None:
     """What is summed over patches: the source's values, their squares, their products with the reference."""
     for u in range(len(warped)):
@@ -148,7 +141,7 @@ def multiply(warped: Floats, subject: Floats, image: Floats, products: Floats) -
         products[2, u] = weighted * image[u]
 
 
-@_compiled
+@compiled
 def add(products: Floats, columns: Doubles) -> None:
     """A row joins the sums over columns; in double precision, adding and removing loses nothing."""
     for channel in range(3):
@@ -156,7 +149,7 @@ def add(products: Floats, columns: Doubles) -> None:
             columns[channel, u] += np.float64(products[channel, u])
 
 
-@_compiled
+@compiled
 def remove(products: Floats, columns: Doubles) -> None:
     """A row leaves the sums over columns."""
     for channel in range(3):
@@ -164,7 +157,7 @@ def remove(products: Floats, columns: Doubles) -> None:
             columns[channel, u] -= np.float64(products[channel, u])
 
 
-@_compiled
+@compiled
 def add_across(columns: Doubles, sums: Floats) -> None:
     """Sums over patches from those over columns."""
     if columns.shape[1] - sums.shape[1] == 6:  # a number that the compiler knows is four times as fast
@@ -173,7 +166,7 @@ def add_across(columns: Doubles, sums: Floats) -> None:
         add_neighbours(columns, columns.shape[1] - sums.shape[1] + 1, sums)
 
 
-@_compiled
+@compiled
 def add_neighbours(columns: Doubles, size: int, sums: Floats) -> None:
     for channel in range(3):
         for u in range(sums.shape[1]):
@@ -183,7 +176,7 @@ def add_neighbours(columns: Doubles, size: int, sums: Floats) -> None:
             sums[channel, u] = np.float32(total)
 
 
-@_compiled
+@compiled
 def correlation(
     sums: Floats,
     count: Floats,
@@ -203,7 +196,7 @@ def correlation(
         scores[u] = value if seen[u] > ZERO else -ONE
 
 
-@_compiled
+@compiled
 def soft_maximum(per_source: Floats, temperature: np.float32) -> None:
     """Mean weighted by e^(score / temperature) over the first axis of (sources, planes, rows, columns).
 
@@ -230,7 +223,7 @@ def soft_maximum(per_source: Floats, temperature: np.float32) -> None:
                 per_source[0, plane, row, u] = total[u] / weight[u]
 
 
-@_compiled
+@compiled
 def exponential(x: np.float32) -> np.float32:
     """e^x for x from -14 to 0, to 2e-5 of itself: (e^(x / 64))^64, as vector instructions.
 

@@ -67,14 +67,14 @@ def first_crossing(
     """
     place, hit = start.clone(), torch.zeros_like(start, dtype=torch.bool)
     number, end, infinite = torch.arange(len(start), device=start.device), start + reach, start + torch.inf
-    going = [number, origins, directions, end, start, start, infinite, infinite, place, hit]
+    going, state = [origins, directions, end], [start, start, infinite, infinite, place, hit]
     for first in range(0, steps, _TOGETHER):
         for _ in range(first, min(first + _TOGETHER, steps)):
-            going[4:] = _traced(distance, shortest, longest, *going[1:])
-        number, _, _, end, _, last, _, _, at, met = going
+            state = _traced(distance, shortest, longest, *going, *state)
+        _, last, _, _, at, met = state
         place[number], hit[number] = at, met
-        left = ~met & (last < end)
-        going = [state[left] for state in going]
+        left = ~met & (last < going[2])
+        number, going, state = number[left], [x[left] for x in going], [x[left] for x in state]
     return Crossing(along=place, hit=hit)
 
 

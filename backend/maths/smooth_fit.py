@@ -5,12 +5,12 @@ linear (Calakli and Taubin, "SSD: smooth signed distance surface reconstruction"
 simplest discrete form): solved by conjugate gradients, to start from a coarser grid's solution.
 """
 
-import numpy as np
 import torch
-from jaxtyping import Float, Float32
+from jaxtyping import Float
 from torch import Tensor
 
 from ..kernels import bending
+from ..kernels.compiled import floats
 from .conjugate_gradients import conjugate_gradients
 from .grid import laplacian
 
@@ -26,10 +26,10 @@ def fit_smooth(
     """`steps` of conjugate gradients with the diagonal as preconditioner, from `start`."""
     if weight.device.type == "cpu" and weight.dtype == torch.float32:
         solution = bending.conjugate_gradients(
-            _numpy(weight),
+            floats(weight),
             smoothness,
-            _numpy(weight * target),
-            _numpy(start),
+            floats(weight * target),
+            floats(start),
             steps=steps,
             threads=torch.get_num_threads(),
         )
@@ -52,8 +52,3 @@ def in_torch(
         return weight * f + smoothness * laplacian(laplacian(f))
 
     return conjugate_gradients(apply, diagonal, weight * target, start, steps=steps)
-
-
-def _numpy(values: Float[Tensor, "*shape"]) -> Float32[np.ndarray, "*shape"]:
-    """Without gaps in memory."""
-    return values.contiguous().numpy()

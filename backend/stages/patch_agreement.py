@@ -4,9 +4,10 @@ from collections.abc import Iterator
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Float32
+from jaxtyping import Bool, Float
 from torch import Tensor
 
+from ..kernels.compiled import floats
 from ..kernels.patch_correlation import correlate, soft_maximum
 from ..kernels.side_by_side import side_by_side
 from ..maths.correlation import correlation
@@ -62,13 +63,13 @@ def _compiled(
 ) -> Float[Tensor, "planes height width"]:
     """`agreement` on the CPU, tiles side by side."""
     of = window.patches
-    patches = (_numpy(of.image), _numpy(of.subject), _numpy(of.count), _numpy(of.mean), _numpy(of.variance))
+    patches = (floats(of.image), floats(of.subject), floats(of.count), floats(of.mean), floats(of.variance))
     compared = []
     for source in sources:
         a, b = epipolar_map(source.camera, window.camera)
         floor = np.float32(max(window.noise, source.noise) ** 2)
-        compared.append((_numpy(source.grey), (_numpy(a), _numpy(b)), floor))
-    depths = _numpy(inverse_depth)
+        compared.append((floats(source.grey), (floats(a), floats(b)), floor))
+    depths = floats(inverse_depth)
     scores = np.full(depths.shape, -1, np.float32)
 
     def compare(tile: tuple[int, int, int, int]) -> None:
@@ -83,17 +84,13 @@ def _compiled(
     return torch.from_numpy(scores)
 
 
-def _numpy(values: Float[Tensor, "*shape"]) -> Float32[np.ndarray, "*shape"]:
-    """Without gaps in memory."""
-    return values.to(torch.float32).contiguous().numpy()
-
-
 def _tiles(asked: Bool[Tensor, "height width"]) -> Iterator[tuple[int, int, int, int]]:
     """(top, bottom, left, right) around what is asked in each tile of the image."""
     height, width = asked.shape
+    whole = asked.numpy()
     for top in range(0, height, _TILE[0]):
         for left in range(0, width, _TILE[1]):
-            part = asked[top : top + _TILE[0], left : left + _TILE[1]].numpy()
+            part = whole[top : top + _TILE[0], left : left + _TILE[1]]
             rows, columns = np.flatnonzero(part.any(axis=1)), np.flatnonzero(part.any(axis=0))
             if len(rows):
                 first, last = top + int(rows[0]), top + int(rows[-1])

@@ -19,7 +19,8 @@ FEATURES_REACH = 1.1
 """The surface goes on where features end."""
 
 ROOM = 2.5
-"""Times the radius of what all photographs show whole, from which on the rest is the room around it. Measured
+"""Times the radius of what all photographs show whole, from which on the rest is the room around it, and the
+subject, where most of the points lie, would be a trifle in a sphere around all of them. Measured
 with things that stand alone 0.6 to 1.1, with a facade 1.6, with a vase on a table in a room 8."""
 
 LEAST_COMMON = 0.6
@@ -57,11 +58,12 @@ def find_region(solved: SolvedCameras, config: RegionConfig, *, progress: Progre
     cameras = [view.camera for view in solved.views]
     if len(solved.sparse_positions) >= 20:
         centre, radius = _of_points(solved)
-        framed = _framed(solved, radius)
-        if framed is not None:
-            share = f"{framed.share:.0%} of the triangulated points lie there, the others up to "
-            share += f"{radius / framed.radius:.0f} times as far from each other"
-            return _region(framed.centre, framed.radius, "what all photographs have in their middle", share)
+        middle, within = _shown_whole(cameras)
+        share = float((np.linalg.norm(solved.sparse_positions - middle, axis=1) < within).mean())
+        if 0 < ROOM * within <= radius and share > 0.5:
+            because = f"{share:.0%} of the triangulated points lie there, the others up to "
+            because += f"{radius / within:.0f} times as far from each other"
+            return _region(middle, within, "what all photographs have in their middle", because)
         because = f"no masks, but {len(solved.sparse_positions)} triangulated points"
         radius *= FEATURES_REACH * config.margin
         return _region(centre, radius, "where the photographs overlap", because)
@@ -86,9 +88,8 @@ def nearest_to_axes(cameras: list[Camera]) -> Float64[np.ndarray, "3"]:
 
 
 def _of_cameras(cameras: list[Camera]) -> tuple[Float64[np.ndarray, "3"], float]:
-    """The largest sphere around the common look-at point that every photograph shows whole."""
-    centre = nearest_to_axes(cameras)
-    radius = min(_radius_in_frame(camera, centre) for camera in cameras)
+    """What all cameras look at, where there are no points to tell more."""
+    centre, radius = _shown_whole(cameras)
     if radius <= 0:
         raise ReconstructionError(
             ErrorCode.CAMERAS_UNUSABLE,
@@ -96,6 +97,12 @@ def _of_cameras(cameras: list[Camera]) -> tuple[Float64[np.ndarray, "3"], float]
             "Check the cameras file, or give masks of the subject.",
         )
     return centre, radius
+
+
+def _shown_whole(cameras: list[Camera]) -> tuple[Float64[np.ndarray, "3"], float]:
+    """The largest sphere around the look-at point that all photographs show whole; radius <= 0: none."""
+    centre = nearest_to_axes(cameras)
+    return centre, min(_radius_in_frame(camera, centre) for camera in cameras)
 
 
 def _radius_in_frame(camera: Camera, centre: Float64[np.ndarray, "3"]) -> float:
@@ -134,30 +141,6 @@ def _of_points(solved: SolvedCameras) -> tuple[Float64[np.ndarray, "3"], float]:
         centre = (low + high) / 2
     distance = np.linalg.norm(points - centre, axis=1)
     return centre, weighted_quantile(distance, weight, 0.93)
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Framed:
-    """A sphere in the middle of all photographs, and the share of the points in it."""
-
-    centre: Float64[np.ndarray, "3"]
-    radius: float
-    share: float
-
-
-def _framed(solved: SolvedCameras, radius: float) -> _Framed | None:
-    """What photographs are taken of in a room: the largest sphere that all of them show whole.
-
-    None unless the optical axes meet there, most of the points lie there, and the sphere around the bulk of
-    all points, of that radius, is so much larger that the subject would be a trifle in it.
-    """
-    cameras = [view.camera for view in solved.views]
-    centre = nearest_to_axes(cameras)
-    within = min(_radius_in_frame(camera, centre) for camera in cameras)
-    if within <= 0 or radius < ROOM * within:
-        return None
-    share = float((np.linalg.norm(solved.sparse_positions - centre, axis=1) < within).mean())
-    return _Framed(centre=centre, radius=within, share=share) if share > 0.5 else None
 
 
 def weighted_quantile(

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from backend.kernels.patch_correlation import Floats, correlate, exponential
+from backend.kernels.compiled import Floats
+from backend.kernels.patch_correlation import correlate, exponential
 
 NOWHERE_ELSE = (np.eye(3, dtype=np.float32), np.zeros(3, np.float32))
 FLOOR = np.float32(1e-5)
