@@ -70,13 +70,17 @@ SUITE ?= quick
 SEEDS ?= $(if $(filter quick,$(SUITE)),1,3)
 # Seconds for fitting the surface, to measure each preset with as well: BUDGETS="10 20 40 80 160".
 BUDGETS ?=
+# Others than the presets in use: PRESETS="neus sparsecraft nerf", with ONLY_BUDGETS=1 where they take long without one.
+PRESETS ?= fast balanced
+ONLY_BUDGETS ?=
 DATA ?= $(wildcard ../shared/data)
 
 # Renders what is missing or out of date, then measures what is not known yet or has changed.
 benchmark: .venv/.ready .venv-blender/.ready
 	$(BPY) -m benchmarks.render_scenes $(SUITE) --output $(BENCHMARK)/scenes $(if $(DATA),--data $(DATA))
-	$(BACKEND) -m backend benchmark $(SUITE) --output $(BENCHMARK)/$(SUITE) --seeds $(SEEDS) \
-	    $(if $(BUDGETS),--budgets $(BUDGETS)) --scenes $(BENCHMARK)/scenes $(if $(DATA),--photos $(DATA))
+	$(BACKEND) -m backend benchmark $(SUITE) --output $(BENCHMARK)/$(SUITE) --seeds $(SEEDS) --presets $(PRESETS) \
+	    $(if $(BUDGETS),--budgets $(BUDGETS)) $(if $(ONLY_BUDGETS),--only-budgets) \
+	    --scenes $(BENCHMARK)/scenes $(if $(DATA),--photos $(DATA))
 
 CASES ?= monkey_3 plaster_6
 

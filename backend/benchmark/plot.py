@@ -32,7 +32,7 @@ def draw(path: Path, summaries: Sequence[Summary]) -> None:
     """Write an SVG: error, and difference from held-out views, against seconds after the cameras are known.
 
     A colour for each case, a marker for each preset. Filled and joined is the Pareto front of a case; hollow
-    is what a preset of the same case beats in both. Dots on a dashed line are a preset's runs with a budget,
+    is what a preset of the same case beats in both. Small and dashed are a preset's runs with a budget,
     in order of time; they take no part in the front.
     """
     with matplotlib.rc_context(_STYLE):
@@ -73,6 +73,10 @@ def _legend(axes: "Axes") -> dict[str, "Artist"]:
     return dict(zip(labels, handles, strict=True))
 
 
+def _marker(presets: Sequence[str], preset: str) -> str:
+    return _MARKERS[presets.index(preset) % len(_MARKERS)]
+
+
 def _panel(axes: "Axes", summaries: Sequence[Summary], number: str) -> None:
     points = points_of(summaries, number)
     presets = list(dict.fromkeys(summary.preset for summary in summaries))
@@ -88,7 +92,7 @@ def _panel(axes: "Axes", summaries: Sequence[Summary], number: str) -> None:
                 [x],
                 [y],
                 color=colour,
-                marker=_MARKERS[presets.index(preset) % len(_MARKERS)],
+                marker=_marker(presets, preset),
                 markerfacecolor=colour if place in front else "white",
                 linestyle="none",
                 label=f"{case}, {preset}",
@@ -97,8 +101,16 @@ def _panel(axes: "Axes", summaries: Sequence[Summary], number: str) -> None:
             curve = budget_curve([pair for pair in mine if pair[0].preset == preset])
             if curve:
                 seconds, errors = zip(*curve, strict=True)
-                label = f"{case}, {preset}, budgets"
-                axes.plot(seconds, errors, "o--", color=colour, linewidth=0.8, markersize=3, label=label)
+                axes.plot(
+                    seconds,
+                    errors,
+                    color=colour,
+                    marker=_marker(presets, preset),
+                    markersize=3,
+                    linestyle="--",
+                    linewidth=0.8,
+                    label=f"{case}, {preset}, budgets",
+                )
     if points:
         axes.set_xscale("log")
         axes.set_yscale("log")

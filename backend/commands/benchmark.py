@@ -42,6 +42,7 @@ def add_benchmark(parser: argparse.ArgumentParser) -> None:
         default=[],
         help="run each preset also with these times for fitting the surface",
     )
+    add("--only-budgets", action="store_true", help="leave out the runs without a budget")
     add("--device", choices=DEVICES, default="auto", help="where to compute (auto)")
 
 
@@ -68,6 +69,7 @@ def _measure_all(parsed: argparse.Namespace, program: tuple[str, ...], request: 
 
     found = find_cases(SUITES[parsed.suite], parsed.scenes, parsed.photos)
     _check(parsed, found)
+    budgets_s = parsed.budgets if parsed.only_budgets else [None, *parsed.budgets]
     machine = machine_facts()
     about = {
         "suite": parsed.suite,
@@ -83,7 +85,7 @@ def _measure_all(parsed: argparse.Namespace, program: tuple[str, ...], request: 
     trials = [
         Trial(case=case, folder=folder, preset=preset, seed=seed, device=parsed.device, budget_s=budget_s)
         for case, folder in found.cases
-        for preset, budget_s, seed in product(parsed.presets, [None, *parsed.budgets], range(parsed.seeds))
+        for preset, budget_s, seed in product(parsed.presets, budgets_s, range(parsed.seeds))
     ]
     runs = measured_before(parsed.output, found, parsed.device, machine)
 
@@ -110,6 +112,12 @@ def _measure_all(parsed: argparse.Namespace, program: tuple[str, ...], request: 
 
 def _check(parsed: argparse.Namespace, found: Found) -> None:
     """ReconstructionError where there is nothing to measure or no place for it."""
+    if parsed.only_budgets and not parsed.budgets:
+        raise ReconstructionError(
+            ErrorCode.SETTINGS_INVALID,
+            "--only-budgets leaves nothing to measure where there are no budgets.",
+            "Give --budgets with the seconds for the surface, or leave --only-budgets out.",
+        )
     if not found.cases:
         raise ReconstructionError(
             ErrorCode.NO_PHOTOS,

@@ -118,6 +118,19 @@ def test_each_preset_is_run_with_each_budget_too(photos: Path, tmp_path: Path) -
     assert all(f"| toy | {shown} |" in rows for shown in ("fast", "fast@10s", "fast@2.5s"))
 
 
+def test_what_has_no_end_is_run_with_budgets_only(
+    photos: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    output = tmp_path / "out"
+    chosen = ("--seeds", "1", "--presets", "neus", "--only-budgets")
+    assert command.benchmark(parsed(photos, output, *chosen), program=fake_program()) == EXIT_USER_ERROR
+    assert "no budgets" in capsys.readouterr().err
+    words = parsed(photos, output, *chosen, "--budgets", "10")
+    assert command.benchmark(words, program=fake_program()) == EXIT_FINE
+    runs = json.loads((output / "results.json").read_text())["runs"]
+    assert [(run["preset"], run["budget_s"]) for run in runs] == [("neus", 10.0)]
+
+
 @pytest.mark.parametrize("word", ["0", "-1", "nan", "inf", "long"])
 def test_a_budget_is_a_positive_number(word: str, photos: Path, tmp_path: Path) -> None:
     with pytest.raises(SystemExit):
