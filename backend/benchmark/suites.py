@@ -142,11 +142,15 @@ _MESHES = (
     # These two would show their ends.
     ("bottle", "mesh_fuze/fuze.obj", ("--turn-deg", "90")),
     ("rocker", "mesh_untextured/rocker-arm.obj", ("--turn-deg", "90", "--surface", "plain")),
+    ("avocado", "mesh_avocado/Avocado.gltf", ()),
+    ("fandisk", "mesh_untextured/fandisk.obj", ("--surface", "fine")),
+    ("toy", "mesh_untextured/cheburashka.obj", ("--surface", "spots")),
 )
 _NUM_VIEWS = (3, 6, 12)
 
 _DTU, _TEMPLE, _WALNUT = "photos_dtu_scan118_3view", "photos_temple_sparse_ring", "photos_robovision_1"
 _FOUNTAIN, _BANANA, _BERLIN = "photos_fountain_p11", "photos_banana", "photos_berlin3"
+_OLD = "photos_kermit_et"
 
 _PHOTO_CASES = (
     Case(name="statuette_3_masks", folder=_DTU, given=(0, 1, 2), images="image", masks="mask"),
@@ -167,6 +171,8 @@ _PHOTO_CASES = (
     Case(name="fountain_11_cameras_unknown", folder=_FOUNTAIN, given=tuple(range(11)), cameras=None),
     Case(name="banana_6_cameras_unknown", folder=_BANANA, given=tuple(range(6)), cameras=None),
     Case(name="portal_3_cameras_unknown", folder=_BERLIN, given=(0, 1, 2), cameras=None),
+    Case(name="frog_11_cameras_unknown", folder=_OLD, given=tuple(range(11)), images="kermit", cameras=None),
+    Case(name="et_9_cameras_unknown", folder=_OLD, given=tuple(range(9)), images="ET", cameras=None),
 )
 
 SUITES = MappingProxyType(
