@@ -18,6 +18,7 @@ from pathlib import Path
 from ..backend.wire.protocol import Job, ProtocolError, decode_job, encode_job
 
 JOB_FILE, LOG, RESULT, CLOUD = "job.json", "backend.log", "result", "cloud.ply"
+MESH_FOR_OTHERS = "mesh.glb"
 MESH, RADIANCE, CAMERAS, CAMERAS_PAGE, REPORT_PAGE, REPORT_NUMBERS, SPARSE = (
     "mesh.ply",
     "radiance.npz",
@@ -85,6 +86,11 @@ def read_job_file(folder: Path) -> Job:
         if path.stat().st_size > _LARGEST_JOB_BYTES:
             raise FolderError(f"{path} is too large to be a job")
         return decode_job(path.read_text(encoding="utf-8"))
+    except FileNotFoundError as error:
+        text = f"{folder} is not the folder of a job from Blender: it has no {JOB_FILE}"
+        if (folder / MESH).is_file():
+            text += f". What the command line made comes in by File > Import > glTF, {MESH_FOR_OTHERS}"
+        raise FolderError(text) from error
     except (OSError, UnicodeDecodeError, ProtocolError) as error:
         raise FolderError(f"{path} cannot be read: {error}") from error
 

@@ -139,11 +139,12 @@ _MESHES = (
     # The cow looks the other way and is nearly white.
     ("cow", "mesh_spot/spot.obj", ("--turn-deg", "180", "--exposure-stops", "-0.6")),
     ("duck", "mesh_bob/bob_tri.obj", ()),
-    # These two would show their ends.
+    # The next two would show their ends.
     ("bottle", "mesh_fuze/fuze.obj", ("--turn-deg", "90")),
     ("rocker", "mesh_untextured/rocker-arm.obj", ("--turn-deg", "90", "--surface", "plain")),
     ("avocado", "mesh_avocado/Avocado.gltf", ()),
-    ("fandisk", "mesh_untextured/fandisk.obj", ("--surface", "fine")),
+    # Its back is flat.
+    ("fandisk", "mesh_untextured/fandisk.obj", ("--turn-deg", "180", "--surface", "fine")),
     ("toy", "mesh_untextured/cheburashka.obj", ("--surface", "spots")),
 )
 _NUM_VIEWS = (3, 6, 12)
