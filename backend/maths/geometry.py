@@ -110,10 +110,10 @@ def warp_pixels(
     inverse_depth: Float[Tensor, "planes height width"],
 ) -> Float[Tensor, "planes height width 2"]:
     """Where the source sees reference pixels at the given inverse depths; far outside where it is behind."""
-    base, denominator = _in_source(a, b, pixels, inverse_depth)
+    base, divisor = _in_source(a, b, pixels, inverse_depth)
     where = inverse_depth.new_empty((*inverse_depth.shape, 2))
     for axis in (0, 1):
-        torch.div(torch.addcmul(base[..., axis], inverse_depth, b[axis]), denominator, out=where[..., axis])
+        torch.div(torch.addcmul(base[axis], inverse_depth, b[axis]), divisor, out=where[..., axis])
     return where
 
 
@@ -124,9 +124,8 @@ def match_speed_px(
     inverse_depth: Float[Tensor, "height width"],
 ) -> Float[Tensor, "height width"]:
     """Pixels by which what `warp_pixels` gives moves in the source, per unit of inverse depth."""
-    base, denominator = _in_source(a, b, pixels, inverse_depth)
-    x, y, z = base.unbind(dim=-1)
-    return torch.hypot(z * b[0] - x * b[2], z * b[1] - y * b[2]) / denominator.square()
+    (x, y, z), divisor = _in_source(a, b, pixels, inverse_depth)
+    return torch.hypot(z * b[0] - x * b[2], z * b[1] - y * b[2]) / divisor.square()
 
 
 def _in_source(
@@ -134,11 +133,12 @@ def _in_source(
     b: Float[Tensor, "3"],
     pixels: Float[Tensor, "height width 2"],
     inverse_depth: Float[Tensor, "*planes height width"],
-) -> tuple[Float[Tensor, "height width 3"], Float[Tensor, "*planes height width"]]:
+) -> tuple[tuple[Float[Tensor, "height width"], ...], Float[Tensor, "*planes height width"]]:
     """Where the source sees the pixels at infinity, homogeneous, and the divisor at the inverse depths."""
-    base = pixels @ a[:, :2].T + a[:, 2]
-    divisor = base[..., 2] + inverse_depth * b[2]
-    return base, torch.where(divisor > 1e-6, divisor, 1e-9)  # behind: thrown out of the image
+    column, row = pixels.unbind(dim=-1)
+    x, y, z = ((a[axis, 0] * column).add_(a[axis, 1] * row).add_(a[axis, 2]) for axis in range(3))
+    divisor = z + inverse_depth * b[2]
+    return (x, y, z), torch.where(divisor > 1e-6, divisor, 1e-9)  # behind: thrown out of the image
 
 
 def inside(pixels: Float[Tensor, "*batch 2"], width: int, height: int) -> Bool[Tensor, "*batch"]:

@@ -11,8 +11,14 @@ from jaxtyping import Bool, Float, Float32, Int, Int64
 from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 
+from ..kernels import plane_fits
+from ..kernels.compiled import floats
+from ..kernels.side_by_side import side_by_side
 from .geometry import Pinhole, pixel_centres
 from .pieces import connected_pieces
+
+_BAND = 64
+"""Rows that a thread looks at in one go."""
 
 
 def fit_planes(
@@ -24,24 +30,53 @@ def fit_planes(
     0.01 / (0.01 + variance of the window's pixels), 0.5 % for a full window of radius 2. What is
     measured where the weight is 0 has no say, whatever it is.
     """
-    offsets = torch.arange(-radius, radius + 1, dtype=weight.dtype, device=weight.device)
-    v, u = torch.meshgrid(offsets, offsets, indexing="ij")
-    moments = torch.stack([torch.ones_like(u), u, v, u * u, u * v, v * v])[:, None]
     # less a mean, so that small slopes are not lost beside it
     usual = (weight * torch.where(weight > 0, inverse_depth, 0.0)).sum() / weight.sum().clamp(min=1e-9)
     beyond = torch.where(weight > 0, weight * (inverse_depth - usual), 0.0)
+    if weight.device.type == "cpu" and weight.dtype == torch.float32:
+        return _compiled_planes(weight, beyond, float(usual), radius)
+    return planes_in_torch(weight, beyond, usual, radius)
+
+
+def planes_in_torch(
+    weight: Float[Tensor, "height width"],
+    beyond: Float[Tensor, "height width"],
+    usual: Float[Tensor, ""],
+    radius: int,
+) -> Float[Tensor, "3 height width"]:
+    """`fit_planes` of the weighted values less `usual`; the reference for what is compiled."""
+    offsets = torch.arange(-radius, radius + 1, dtype=weight.dtype, device=weight.device)
+    v, u = torch.meshgrid(offsets, offsets, indexing="ij")
+    moments = torch.stack([torch.ones_like(u), u, v, u * u, u * v, v * v])[:, None]
     of_weight = F.conv2d(weight[None, None], moments, padding=radius)[0]
     of_values = F.conv2d(beyond[None, None], moments[:3], padding=radius)[0]
     total = of_weight[0].clamp(min=1e-9)
     mean_u, mean_v, mean_uu, mean_uv, mean_vv = of_weight[1:] / total
     mean_w, mean_uw, mean_vw = of_values / total
-    prior = 1e-2
+    prior = float(plane_fits.PRIOR)
     uu, uv, vv = mean_uu - mean_u**2 + prior, mean_uv - mean_u * mean_v, mean_vv - mean_v**2 + prior
     uw, vw = mean_uw - mean_u * mean_w, mean_vw - mean_v * mean_w
     determinant = uu * vv - uv * uv
     slope_u = (vv * uw - uv * vw) / determinant
     slope_v = (uu * vw - uv * uw) / determinant
     return torch.stack([usual + mean_w - slope_u * mean_u - slope_v * mean_v, slope_u, slope_v])
+
+
+def _compiled_planes(
+    weight: Float[Tensor, "height width"], beyond: Float[Tensor, "height width"], usual: float, radius: int
+) -> Float[Tensor, "3 height width"]:
+    """`fit_planes` on the CPU, bands of rows side by side."""
+    around = [radius] * 4
+    padded = floats(F.pad(weight, around)), floats(F.pad(beyond, around))
+    height, width = weight.shape
+    planes = np.empty((3, height, width), np.float32)
+
+    def fit(top: int) -> None:
+        rows = (top, min(top + _BAND, height))
+        plane_fits.fit_planes(rows, *padded, np.float32(usual), radius, planes)
+
+    side_by_side(fit, range(0, height, _BAND), torch.get_num_threads())
+    return torch.from_numpy(planes)
 
 
 def normals_from_planes(

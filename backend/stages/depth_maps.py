@@ -13,10 +13,8 @@ from ..maths.correlation import window_mean, window_sum
 from ..maths.geometry import (
     Pinhole,
     epipolar_map,
-    inside,
     match_speed_px,
     pixel_centres,
-    project,
     sample_image,
     unproject,
 )
@@ -29,6 +27,7 @@ from ..maths.inverse_depth import (
 from ..maths.median import median_3x3
 from ..maths.semi_global import aggregate
 from ..scene import Progress, within
+from .cross_check import cross_check
 from .patch_agreement import agreement
 from .stereo_config import StereoConfig
 from .stereo_windows import Window, views_between
@@ -315,7 +314,17 @@ def _votes(
         for other in range(len(maps))
         if other in nearby[index] or (other != index and index in nearby[other])
     ]
-    said = {other: _judged(points, pixels, own, maps[other], config) for other in compared}
+    said = {
+        other: cross_check(
+            own.window.camera,
+            own.inverse_depth,
+            maps[other].window.camera,
+            torch.stack([maps[other].inverse_depth, maps[other].score]),
+            least_score=config.min_correlation - 0.1,
+            largest_px=config.max_reprojection_px,
+        )
+        for other in compared
+    }
     cameras = [map_.window.camera for map_ in maps]
     votes = torch.ones_like(own.inverse_depth)
     for other, (agrees, _) in said.items():
@@ -327,28 +336,3 @@ def _votes(
         votes += agrees & (confirmed | ~denied)
     good = own.window.subject & (own.score > config.min_correlation) & (points.norm(dim=-1) < 1.0)
     return torch.where(good & (votes > 1), votes, 0.0)
-
-
-def _judged(
-    points: Float[Tensor, "height width 3"],
-    pixels: Float[Tensor, "height width 2"],
-    own: Map,
-    other: Map,
-    config: StereoConfig,
-) -> tuple[Bool[Tensor, "height width"], Bool[Tensor, "height width"]]:
-    """Whether another view agrees with the points, and whether it has found something else where they are.
-
-    It agrees where its own point, seen from here, falls on the pixel that was asked for and has its depth.
-    """
-    seen_at, depth = project(other.window.camera, points)
-    both = torch.stack([other.inverse_depth, other.score])
-    inverse_depth, score = sample_image(both, seen_at[None])[0]
-    found = inside(seen_at, other.window.camera.width, other.window.camera.height) & (depth > 0)
-    found &= score > config.min_correlation - 0.1
-    there = unproject(other.window.camera, seen_at, 1 / inverse_depth.clamp(min=1e-6))
-    back_at, back_depth = project(own.window.camera, there)
-    moved = torch.hypot(*(back_at - pixels).unbind(dim=-1))
-    step = 1 / own.inverse_depth.clamp(min=1e-6)
-    relative = (back_depth - step).abs() / step
-    same = (moved < config.max_reprojection_px) & (relative < 0.01)
-    return found & same, found & ~same

@@ -6,6 +6,7 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
+from backend.maths import inverse_depth
 from backend.maths.geometry import Pinhole, pixel_centres, ray_directions
 from backend.maths.inverse_depth import (
     distance_from_edges_px,
@@ -14,6 +15,7 @@ from backend.maths.inverse_depth import (
     normals_from_planes,
     parabola_offset,
     piece_sizes,
+    planes_in_torch,
 )
 
 CPU = torch.device("cpu")
@@ -55,6 +57,19 @@ def test_fit_matches_regression_window_by_window() -> None:
     torch.testing.assert_close(
         fit_planes(values, random_weight(), 2), fit_one_by_one(values, random_weight(), 2), atol=1e-5, rtol=0
     )
+
+
+@pytest.mark.parametrize("radius", [1, 2, 3, 5])
+@pytest.mark.parametrize("threads", [1, 3])
+def test_compiled_as_in_torch(radius: int, threads: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Bands of rows on threads of their own, the last one shorter, are the reference's planes."""
+    monkeypatch.setattr(inverse_depth, "_BAND", 5)
+    monkeypatch.setattr(torch, "get_num_threads", lambda: threads)
+    values, weight = plane_map() + 0.1 * random_weight().flip(0), random_weight()
+    weight[:6, :7] = 0
+    usual = (weight * values).sum() / weight.sum()
+    reference = planes_in_torch(weight, weight * (values - usual), usual, radius)
+    torch.testing.assert_close(fit_planes(values, weight, radius), reference, atol=3e-5, rtol=0)
 
 
 @pytest.mark.parametrize("radius", [2, 4])
