@@ -36,7 +36,11 @@ PRESETS = MappingProxyType(
         "fast": Settings(
             photos=PhotosConfig(max_side_px=800),
             stereo=StereoConfig(
-                first_pixel_size=2, num_sources=2, coarse_pixels=15_000, growth_rounds=(1, 2, 2)
+                first_pixel_size=2,
+                num_sources=2,
+                coarse_pixels=15_000,
+                growth_rounds=(1, 2, 2),
+                free_leverage=1.2,
             ),
             train=TrainConfig(levels=(32, 64, 96), rounds=(10, 10, 5), linear=LinearConfig(settled=0.01)),
             mesh=MeshConfig(max_faces=100_000),

@@ -21,6 +21,7 @@ from ..errors import ErrorCode, ReconstructionError
 from ..maths.backdrop import find_backdrop
 from ..maths.geometry import pinhole_in_object, pixel_centres, sample_image, unproject
 from ..maths.inverse_depth import fit_planes, normals_from_planes
+from ..maths.texture import leverage
 from ..scene import Camera, Decision, Progress, Region, SurfacePoints, View, within
 from .depth_maps import Measured, depth_maps
 from .stereo_config import StereoConfig
@@ -143,7 +144,7 @@ def _confidence(measured: Measured, config: StereoConfig) -> Float[Tensor, "heig
     """Agreement of the patches; 0 where nothing is measured.
 
     Where two views agree it is half as much as where many do. It is less for large pixels, where the patches
-    would agree as well at another depth, and beside edges.
+    would agree as well at another depth, where their texture lies to one side, and beside edges.
     """
     window = measured.map.window
     agreement = measured.map.score.clamp(0, 1)
@@ -153,6 +154,9 @@ def _confidence(measured: Measured, config: StereoConfig) -> Float[Tensor, "heig
     sharp = (measured.sharpness / config.full_sharpness).clamp(0, 1).sqrt()
     off_edge = measured.from_edge_px / (measured.from_edge_px + config.patch_radius)
     confidence: Float[Tensor, "height width"] = trust * agreement * certain * sharp * off_edge
+    if math.isfinite(config.free_leverage):
+        aside = leverage(window.grey, window.subject, config.patch_radius, window.noise)
+        confidence = confidence * (config.free_leverage / aside).clamp(max=1)
     return confidence
 
 

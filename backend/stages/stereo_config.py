@@ -1,5 +1,6 @@
 """How hard stereo looks."""
 
+import math
 from dataclasses import dataclass
 
 
@@ -21,6 +22,12 @@ class StereoConfig:
     """Patches that agree less than this are not measurements."""
     full_sharpness: float = 0.03
     """Patches whose agreement drops by less than this one pixel off say less about depth."""
+    free_leverage: float = math.inf
+    """Patches whose texture lies further to one side say less about the depth of their middle.
+
+    That pays where photographs are compared at half their size; at full size patches are small beside what
+    they show.
+    """
     max_reprojection_px: float = 1.0
     """How far a point may move when carried to another photograph's depth map and back."""
     trust_of_half_size: float = 0.63

@@ -213,6 +213,31 @@ def test_points_beside_the_outline_are_trusted_less() -> None:
     assert confidence[beside].mean() < 0.5 * confidence[within].mean()
 
 
+def test_patches_whose_texture_lies_to_one_side_are_trusted_less_where_asked() -> None:
+    """Of blotches only the borders tell depth; no point is trusted more, and wrong ones less than others."""
+    wide = photographed(arc_cameras(3, 30, 320))
+    blotches = tuple(
+        replace(view, image_srgb=(0.4 + 0.2 * (view.image_srgb > 0.6)).astype(np.float32))
+        for view in wide.views
+    )
+    usual, asked = (
+        match_views(
+            blotches,
+            true_region(),
+            StereoConfig(free_leverage=free),
+            device=torch.device("cpu"),
+            progress=no_progress,
+        )
+        for free in (np.inf, 1.2)
+    )
+    np.testing.assert_array_equal(usual.points.positions, asked.points.positions)
+    share = asked.points.confidence / usual.points.confidence
+    assert share.max() < 1 + 1e-6
+    apart = errors_percent(usual)
+    before, after = (np.average(apart, weights=found.points.confidence**3.0) for found in (usual, asked))
+    assert after < 0.95 * before
+
+
 def test_stripes_along_the_epipolar_lines_tell_nothing() -> None:
     """Their patches agree as well as those of any other stripes, but they do so at every depth."""
     assert striped_wall_confidence(axis=0).mean() > 0.3
