@@ -154,7 +154,7 @@ def _confidence(measured: Measured, config: StereoConfig) -> Float[Tensor, "heig
     sharp = (measured.sharpness / config.full_sharpness).clamp(0, 1).sqrt()
     off_edge = measured.from_edge_px / (measured.from_edge_px + config.patch_radius)
     confidence: Float[Tensor, "height width"] = trust * agreement * certain * sharp * off_edge
-    if math.isfinite(config.free_leverage):
+    if config.free_leverage is not None:
         aside = leverage(window.grey, window.subject, config.patch_radius, window.noise)
         confidence = confidence * (config.free_leverage / aside).clamp(max=1)
     return confidence

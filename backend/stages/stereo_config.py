@@ -1,6 +1,5 @@
 """How hard stereo looks."""
 
-import math
 from dataclasses import dataclass
 
 
@@ -22,8 +21,8 @@ class StereoConfig:
     """Patches that agree less than this are not measurements."""
     full_sharpness: float = 0.03
     """Patches whose agreement drops by less than this one pixel off say less about depth."""
-    free_leverage: float = math.inf
-    """Patches whose texture lies further to one side say less about the depth of their middle.
+    free_leverage: float | None = None
+    """Patches whose texture lies further to one side say less about the depth of their middle; None: no less.
 
     That pays where photographs are compared at half their size; at full size patches are small beside what
     they show.
