@@ -9,6 +9,8 @@ Floats = NDArray[np.float32]
 Doubles = NDArray[np.float64]
 Ints = NDArray[np.int32]
 
+ZERO, HALF, ONE = np.float32(0), np.float32(0.5), np.float32(1)
+
 _rounding_alone = {"contract", "arcp", "nsz"}
 # what changes a result by rounding only: not a number stays what it is
 compiled = njit(cache=True, nogil=True, error_model="numpy", fastmath=_rounding_alone)

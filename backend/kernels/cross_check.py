@@ -6,12 +6,10 @@ The same as `backend.stages.cross_check.in_torch`, which is the reference and wh
 import numpy as np
 from numpy.typing import NDArray
 
-from .compiled import Floats, compiled
+from .compiled import HALF, ONE, ZERO, Floats, compiled
 from .patch_correlation import find, interpolate, warp
 
 Flags = NDArray[np.bool_]
-
-ZERO, HALF, ONE = np.float32(0), np.float32(0.5), np.float32(1)
 
 
 @compiled

@@ -8,9 +8,7 @@ instructions. Calls release Python's lock: tiles of an image can be worked on si
 
 import numpy as np
 
-from .compiled import Doubles, Floats, Ints, compiled
-
-ZERO, HALF, ONE = np.float32(0), np.float32(0.5), np.float32(1)
+from .compiled import HALF, ONE, ZERO, Doubles, Floats, Ints, compiled
 
 
 @compiled

@@ -5,9 +5,8 @@ The same as `backend.maths.inverse_depth.in_torch`, which is the reference and w
 
 import numpy as np
 
-from .compiled import Floats, compiled
+from .compiled import ONE, ZERO, Floats, compiled
 
-ZERO, ONE = np.float32(0), np.float32(1)
 PRIOR = np.float32(1e-2)
 
 

@@ -5,6 +5,9 @@ from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 from typing import TypeVar
 
+BAND = 64
+"""Rows that a thread works on in one go."""
+
 Task = TypeVar("Task")
 Result = TypeVar("Result")
 
@@ -14,6 +17,12 @@ def side_by_side(work: Callable[[Task], Result], tasks: Iterable[Task], threads:
     if threads == 1:
         return [work(task) for task in tasks]
     return list(_pool(threads).map(work, tasks))
+
+
+def bands_side_by_side(work: Callable[[tuple[int, int]], None], height: int, threads: int) -> None:
+    """Of rows, given as (first, one past the last), together all of the height."""
+    tops = range(0, height, BAND)
+    side_by_side(work, [(top, min(top + BAND, height)) for top in tops], threads)
 
 
 @cache

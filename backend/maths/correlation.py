@@ -19,6 +19,16 @@ def window_sum(
     return _sum_along(_sum_along(values, -1, radius), -2, radius)
 
 
+def window_moments(
+    values: Float[Tensor, "height width"], radius: int, *, second: bool
+) -> Float[Tensor, "moments height width"]:
+    """Sums over the window of values times 1, u, v and, if asked, u^2, u v, v^2; u and v from its middle."""
+    offsets = torch.arange(-radius, radius + 1, dtype=values.dtype, device=values.device)
+    v, u = torch.meshgrid(offsets, offsets, indexing="ij")
+    moments = torch.stack([torch.ones_like(u), u, v, *((u * u, u * v, v * v) if second else ())])
+    return F.conv2d(values[None, None], moments[:, None], padding=radius)[0]
+
+
 def _sum_along(
     values: Float[Tensor, "*batch height width"], axis: int, radius: int
 ) -> Float[Tensor, "*batch height width"]:

@@ -13,12 +13,10 @@ from torch import Tensor
 
 from ..kernels import plane_fits
 from ..kernels.compiled import floats
-from ..kernels.side_by_side import side_by_side
+from ..kernels.side_by_side import bands_side_by_side
+from .correlation import window_moments
 from .geometry import Pinhole, pixel_centres
 from .pieces import connected_pieces
-
-_BAND = 64
-"""Rows that a thread looks at in one go."""
 
 
 def fit_planes(
@@ -45,11 +43,8 @@ def planes_in_torch(
     radius: int,
 ) -> Float[Tensor, "3 height width"]:
     """`fit_planes` of the weighted values less `usual`; the reference for what is compiled."""
-    offsets = torch.arange(-radius, radius + 1, dtype=weight.dtype, device=weight.device)
-    v, u = torch.meshgrid(offsets, offsets, indexing="ij")
-    moments = torch.stack([torch.ones_like(u), u, v, u * u, u * v, v * v])[:, None]
-    of_weight = F.conv2d(weight[None, None], moments, padding=radius)[0]
-    of_values = F.conv2d(beyond[None, None], moments[:3], padding=radius)[0]
+    of_weight = window_moments(weight, radius, second=True)
+    of_values = window_moments(beyond, radius, second=False)
     total = of_weight[0].clamp(min=1e-9)
     mean_u, mean_v, mean_uu, mean_uv, mean_vv = of_weight[1:] / total
     mean_w, mean_uw, mean_vw = of_values / total
@@ -71,11 +66,10 @@ def _compiled_planes(
     height, width = weight.shape
     planes = np.empty((3, height, width), np.float32)
 
-    def fit(top: int) -> None:
-        rows = (top, min(top + _BAND, height))
+    def fit(rows: tuple[int, int]) -> None:
         plane_fits.fit_planes(rows, *padded, np.float32(usual), radius, planes)
 
-    side_by_side(fit, range(0, height, _BAND), torch.get_num_threads())
+    bands_side_by_side(fit, height, torch.get_num_threads())
     return torch.from_numpy(planes)
 
 

@@ -5,6 +5,8 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from .correlation import window_moments
+
 _OF_A_PIXEL = 0.5
 """Variance, in square pixels, that is added to where texture lies: so thin is no edge."""
 
@@ -28,10 +30,7 @@ def leverage(
     along[:, 1:-1] = (image[:, 2:] - image[:, :-2]) / 2
     down[1:-1] = (image[2:] - image[:-2]) / 2
     energy = (along.square() + down.square()) * inner + (0.5 * noise) ** 2
-    offsets = torch.arange(-radius, radius + 1, dtype=image.dtype, device=image.device)
-    v, u = torch.meshgrid(offsets, offsets, indexing="ij")
-    moments = torch.stack([torch.ones_like(u), u, v, u * u, u * v, v * v])[:, None]
-    sums = F.conv2d(energy[None, None], moments, padding=radius)[0]
+    sums = window_moments(energy, radius, second=True)
     mean_u, mean_v, mean_uu, mean_uv, mean_vv = sums[1:] / sums[0]
     uu, uv, vv = (
         mean_uu - mean_u**2 + _OF_A_PIXEL,

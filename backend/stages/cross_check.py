@@ -7,7 +7,7 @@ from torch import Tensor
 
 from ..kernels import cross_check as kernel
 from ..kernels.compiled import floats
-from ..kernels.side_by_side import side_by_side
+from ..kernels.side_by_side import bands_side_by_side
 from ..maths.geometry import (
     Pinhole,
     epipolar_map,
@@ -20,8 +20,6 @@ from ..maths.geometry import (
 
 _LARGEST_SHARE = 0.01
 """Of the depth, between what two views find."""
-_BAND = 64
-"""Rows that a thread looks at in one go."""
 
 
 def cross_check(
@@ -82,11 +80,10 @@ def _compiled(
     agrees, denies = np.empty(own.shape, np.bool_), np.empty(own.shape, np.bool_)
     limits = (np.float32(largest_px), np.float32(_LARGEST_SHARE))
 
-    def check(top: int) -> None:
-        rows = (top, min(top + _BAND, len(own)))
+    def check(rows: tuple[int, int]) -> None:
         kernel.cross_check(
             rows, own, there, back, found, score, np.float32(least_score), limits, agrees, denies
         )
 
-    side_by_side(check, range(0, len(own), _BAND), torch.get_num_threads())
+    bands_side_by_side(check, len(own), torch.get_num_threads())
     return torch.from_numpy(agrees), torch.from_numpy(denies)

@@ -7,8 +7,8 @@ import pytest
 import torch
 from torch import Tensor
 
+from backend.kernels import side_by_side
 from backend.maths.geometry import Pinhole, pinhole_in_object
-from backend.stages import cross_check as stage
 from backend.stages.cross_check import cross_check, in_torch
 from tests.synthetic_scene import OBJECT_UNIT, Scene, arc_cameras, photographed, true_region
 
@@ -78,7 +78,7 @@ def test_compiled_as_in_torch(
     threads: int,
 ) -> None:
     """But for pixels that lie on a limit."""
-    monkeypatch.setattr(stage, "_BAND", 7)
+    monkeypatch.setattr(side_by_side, "BAND", 7)
     monkeypatch.setattr(torch, "get_num_threads", lambda: threads)
     depth, other = factor * true_depths[0], sure(true_depths[1])
     other[1] = torch.rand(other[1].shape, generator=torch.Generator().manual_seed(0))

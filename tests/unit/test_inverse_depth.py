@@ -6,7 +6,7 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from backend.maths import inverse_depth
+from backend.kernels import side_by_side
 from backend.maths.geometry import Pinhole, pixel_centres, ray_directions
 from backend.maths.inverse_depth import (
     distance_from_edges_px,
@@ -63,7 +63,7 @@ def test_fit_matches_regression_window_by_window() -> None:
 @pytest.mark.parametrize("threads", [1, 3])
 def test_compiled_as_in_torch(radius: int, threads: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """Bands of rows on threads of their own, the last one shorter, are the reference's planes."""
-    monkeypatch.setattr(inverse_depth, "_BAND", 5)
+    monkeypatch.setattr(side_by_side, "BAND", 5)
     monkeypatch.setattr(torch, "get_num_threads", lambda: threads)
     values, weight = plane_map() + 0.1 * random_weight().flip(0), random_weight()
     weight[:6, :7] = 0
