@@ -5,7 +5,7 @@ BPY := .venv-blender/bin/python
 BLENDER ?= blender
 DEMO := build/demo
 
-.PHONY: help demo test test-blender check benchmark ablation scaling points extension screenshots
+.PHONY: help demo test test-blender check benchmark quick ablation scaling points extension screenshots
 .DELETE_ON_ERROR:
 
 help:
@@ -15,7 +15,8 @@ help:
 	@echo "make extension   the zip to install in Blender"
 	@echo "make test-blender BLENDER=blender   the add-on's tests in a real Blender"
 	@echo "make screenshots BLENDER=blender    the pictures of the add-on in docs/images"
-	@echo "make benchmark SUITE=quick   speed against error: table and plot; also scenes, photos; BUDGETS=\"10 20\""
+	@echo "make benchmark SUITE=quick   speed against error: table and plot; also scenes, photos; BUDGETS=\"10 20\"; RECORD=docs/results"
+	@echo "make quick     the suite quick, and whether its numbers are within bounds"
 	@echo "make ablation CASES=\"monkey_3 plaster_6\"   what each part is worth; SEEDS=3 for medians"
 	@echo "make points    surfaces from points alone beside screened Poisson"
 	@echo "make scaling   how time and memory grow with views, pixels and the grid"
@@ -25,6 +26,7 @@ demo: .venv/.ready $(DEMO)/scene/transforms.json
 	    --truth $(DEMO)/scene/truth.ply --output $(DEMO)/result
 
 $(DEMO)/scene/transforms.json: .venv-blender/.ready $(wildcard blender_scenes/*.py)
+	rm -rf $(DEMO)/result  # of the views before: the backend would not replace it
 	$(BPY) -m blender_scenes.render_views --scene monkey --views 6 --layout arc --arc-deg 120 \
 	    --output $(DEMO)/scene
 
@@ -73,6 +75,8 @@ BUDGETS ?=
 # Others than the presets in use: PRESETS="neus sparsecraft nerf", with ONLY_BUDGETS=1 where they take long without one.
 PRESETS ?= fast balanced
 ONLY_BUDGETS ?=
+# A folder for a record that is kept with the code: RECORD=docs/results.
+RECORD ?=
 DATA ?= $(wildcard ../shared/data)
 
 # Renders what is missing or out of date, then measures what is not known yet or has changed.
@@ -80,13 +84,20 @@ benchmark: .venv/.ready .venv-blender/.ready
 	$(BPY) -m benchmarks.render_scenes $(SUITE) --output $(BENCHMARK)/scenes $(if $(DATA),--data $(DATA))
 	$(BACKEND) -m backend benchmark $(SUITE) --output $(BENCHMARK)/$(SUITE) --seeds $(SEEDS) --presets $(PRESETS) \
 	    $(if $(BUDGETS),--budgets $(BUDGETS)) $(if $(ONLY_BUDGETS),--only-budgets) \
+	    $(if $(RECORD),--record $(RECORD)) \
 	    --scenes $(BENCHMARK)/scenes $(if $(DATA),--photos $(DATA))
+
+# For CI: the suite `quick`, its numbers within loose bounds.
+quick:
+	$(MAKE) --no-print-directory benchmark SUITE=quick
+	$(BACKEND) -m benchmarks.within_bounds $(BENCHMARK)/quick/results.json
 
 CASES ?= monkey_3 plaster_6
 
 ablation: .venv/.ready .venv-blender/.ready
 	$(BPY) -m benchmarks.render_scenes --cases $(CASES) --output $(BENCHMARK)/scenes $(if $(DATA),--data $(DATA))
 	$(BACKEND) -m benchmarks.ablation --cases $(CASES) --seeds $(SEEDS) --output $(BENCHMARK)/ablation \
+	    $(if $(RECORD),--record $(RECORD)) \
 	    --scenes $(BENCHMARK)/scenes $(if $(DATA),--photos $(DATA))
 
 scaling: .venv/.ready .venv-blender/.ready

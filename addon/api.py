@@ -14,7 +14,7 @@ import bpy
 
 from ..backend.wire.protocol import PROTOCOL_VERSION, Failed, Job, decode_job, encode_job
 from . import jobs
-from .job_folder import RESULT, new_folder
+from .job_folder import RESULT, folder_for
 from .operators.environment import backend_python_or_reason
 from .operators.reconstruct import start
 from .properties import settings_of
@@ -52,10 +52,10 @@ def reconstruct(
 ) -> Reconstruction:
     """Reconstruct from image files or folders, wait, and bring the mesh into the scene.
 
-    The job gets a folder of its own in `output`. `cameras` are known ones: a transforms.json or a COLMAP
-    model; `region` is a centre and a radius in their frame. Nothing is taken from the panel. Raises
-    JobError where nothing can be started, ValueError for arguments that make no sense, ReconstructionFailed
-    where the backend gives up.
+    The job gets a folder of its own in `output`, and goes on in it where just this job was stopped.
+    `cameras` are known ones: a transforms.json or a COLMAP model; `region` is a centre and a radius in their
+    frame. Nothing is taken from the panel. Raises JobError where nothing can be started, ValueError for
+    arguments that make no sense, ReconstructionFailed where the backend gives up.
     """
     python, reason = backend_python_or_reason(bpy.context)
     if python is None:
@@ -72,9 +72,10 @@ def reconstruct(
         seed=seed,
         region_centre=None if region is None else tuple(map(float, region[0])),
         region_radius=None if region is None else float(region[1]),
+        keep_stages=False,
     )
     _check(asked)
-    folder = new_folder(Path(output).absolute(), "reconstruct")
+    folder = folder_for(Path(output).absolute(), asked)
     start(python, folder, asked, scene_name=bpy.context.scene.name)
     end = jobs.wait()
     if end.failure is not None:

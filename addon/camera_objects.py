@@ -17,10 +17,12 @@ import numpy as np
 from mathutils import Matrix
 from numpy.typing import NDArray
 
+from ..backend.maths.upright import up_direction
+from ..backend.wire.photographs import is_named
 from .camera_lens import apply_lens
 from .exif_orientation import clockwise_turn_deg
 from .intrinsics import Pinhole, aspect_pair, shared_aspect_or_none
-from .job_folder import CAMERAS, RESULT, SPARSE
+from .job_folder import CAMERAS, SPARSE, results_in
 from .placing import upright_from_solved
 from .ply import PlyMesh, read_ply
 from .scenes import scene_named
@@ -49,7 +51,7 @@ class CameraImport:
 
 def read_import(folder: Path, photographs: tuple[Path, ...]) -> CameraImport:
     """What a job's folder has to show. Raises ValueError, a sentence, for files that cannot be used."""
-    result = folder / RESULT
+    result = results_in(folder)
     sparse = result / SPARSE
     return CameraImport(
         job=str(folder.absolute()),
@@ -98,8 +100,7 @@ def photograph_or_none(name: str, photographs: Sequence[Path]) -> Path | None:
         alike = [path for path in files if path.name == last and path.is_file()]
     except OSError:  # a name that no file can have
         return None
-    exact = [path for path in alike if path.as_posix().endswith(f"/{name}")]
-    found = exact or alike
+    found = [path for path in alike if is_named(path.absolute(), name)] or alike
     return found[0] if len(found) == 1 else None
 
 
@@ -137,12 +138,20 @@ def cameras_with_photographs(scene: bpy.types.Scene) -> list[bpy.types.Object]:
     return sorted(found, key=lambda camera: str(camera.get(PHOTO, "")))
 
 
-def camera_of_photograph(scene: bpy.types.Scene, name: str) -> bpy.types.Object | None:
-    """The camera of a photograph by its file name; None where it has none."""
-    if not name:
-        return None
+def camera_of_photograph(scene: bpy.types.Scene, photograph: str) -> bpy.types.Object | None:
+    """The camera of a photograph, given by its path or the end of it; None where it has none.
+
+    Where several jobs placed it, it is that of the cameras in use. Raises ValueError where the name alone is
+    that of several photographs.
+    """
+    path = Path(photograph)
     cameras = cameras_with_photographs(scene)
-    return next((camera for camera in cameras if Path(str(camera[PHOTO])).name == Path(name).name), None)
+    found = [camera for camera in cameras if is_named(path, str(camera[PHOTO]))]
+    found = found or [camera for camera in cameras if is_named(Path(str(camera[PHOTO])), photograph)]
+    names = sorted({str(camera[PHOTO]) for camera in found})
+    if len(names) > 1:
+        raise ValueError(f"Several photographs are called {path.name}: choose {' or '.join(names)}")
+    return max(found, key=lambda camera: camera.get(JOB) == scene.fewview.cameras_job, default=None)
 
 
 def jobs_of(scene: bpy.types.Scene) -> tuple[str, ...]:
@@ -195,7 +204,8 @@ def _make_root(scene: bpy.types.Scene, wanted: CameraImport) -> None:
         _collection(scene, wanted.job).objects.link(root)
         root.empty_display_type = "PLAIN_AXES"
         root.empty_display_size = 0.25
-        root[UPRIGHT] = _upright(wanted).ravel().tolist()
+        points = None if wanted.points is None else wanted.points.positions
+        root[UPRIGHT] = upright(wanted.solved, points).ravel().tolist()
     scene.fewview.root = root
 
 
@@ -327,11 +337,11 @@ def _collection(scene: bpy.types.Scene, job: str) -> bpy.types.Collection:
     return found
 
 
-def _upright(wanted: CameraImport) -> NDArray[np.float64]:
+def upright(solved: SolvedScene, points: NDArray[np.float64] | None = None) -> NDArray[np.float64]:
     """(4, 4) similarity world_from_solved for cameras that have no place of their own."""
-    solved = wanted.solved
-    points = None if wanted.points is None else wanted.points.positions
-    return upright_from_solved(solved.poses, _centre(solved), _size_solved(solved), points=points)
+    axes = solved.poses[:, :3, :3]  # right, up and backwards of each picture
+    up = up_direction(*np.moveaxis(axes / np.linalg.norm(axes, axis=1, keepdims=True), 2, 0))
+    return upright_from_solved(solved.poses, _centre(solved), _size_solved(solved), up=up, points=points)
 
 
 def _centre(solved: SolvedScene) -> NDArray[np.float64]:

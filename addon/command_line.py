@@ -124,7 +124,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--height", type=int, dest="resolution_y")
     add("--samples", type=int)
     add("--engine", type=str.upper, choices=("CYCLES", "WORKBENCH", "SCENE"))
-    commands.add_parser("check", help="check the backend").set_defaults(run=_check)
+    commands.add_parser("check", help="check that FewView is set up").set_defaults(run=_check)
     return parser
 
 

@@ -67,7 +67,7 @@ def find_python(*, variable: str, preference: str, managed: Path) -> FoundPython
     if python.is_file():
         return FoundPython(path=python.absolute(), source="the managed environment")
     if is_ours(managed):
-        raise PythonMissing(f"The Python that {managed} was made from is gone; install the environment again")
+        raise PythonMissing(f"The Python that {managed} was made from is gone: press Set Up FewView again")
     return None
 
 

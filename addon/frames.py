@@ -11,14 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .camera_objects import BAKED, kept_similarity, root_or_none, world_from_solved
-from .job_folder import CAMERAS, JOB_FILE, MESH, RESULT, PastJob, inside
+from .job_folder import CAMERAS, JOB_FILE, MESH, RESULT, PastJob, inside, results_in
 from .placing import similarity_between
 from .ply import read_ply
 
 
 def frame_owner(job: PastJob) -> Path:
     """Folder of the job whose cameras made the frame of this one's results: itself, or an earlier one."""
-    if job.job.cameras is not None:
+    if job.job is not None and job.job.cameras is not None:
         path = Path(job.job.cameras)
         folder = path.parent.parent
         if (path.name, path.parent.name) == (CAMERAS, RESULT) and (folder / JOB_FILE).is_file():
@@ -26,18 +26,19 @@ def frame_owner(job: PastJob) -> Path:
     return job.folder
 
 
-def has_own_frame(job: PastJob) -> bool:
-    """Whether the job estimates its cameras itself."""
-    return job.job.cameras is None
+def finds_cameras(job: PastJob) -> bool:
+    """Whether the job estimates its cameras itself, rather than being given known or estimated ones."""
+    return job.job is not None and job.job.cameras is None
 
 
-def world_from_solved_or_none(scene: bpy.types.Scene, job: PastJob) -> NDArray[np.float64] | None:
-    """(4, 4) similarity; None where the cameras are estimated and not in the scene yet."""
-    owner = frame_owner(job)
-    if not has_own_frame(job) and owner == job.folder:
-        return np.eye(4)
-    root = root_or_none(scene, str(owner.absolute()))
-    return None if root is None else world_from_solved(root)
+def world_from_solved_or_none(
+    scene: bpy.types.Scene, job: PastJob, *, estimated: bool
+) -> NDArray[np.float64] | None:
+    """(4, 4) similarity; None where the cameras were estimated and are not in the scene yet."""
+    root = root_or_none(scene, str(frame_owner(job).absolute()))
+    if root is not None:
+        return world_from_solved(root)
+    return None if estimated else np.eye(4)
 
 
 def world_from_result(result: bpy.types.Object, folder: Path) -> NDArray[np.float64]:
@@ -47,7 +48,7 @@ def world_from_result(result: bpy.types.Object, folder: Path) -> NDArray[np.floa
     applied counts; after a remesh, what the import kept. Raises ValueError where the mesh has become
     another, or the file is damaged, OSError where it cannot be read.
     """
-    path = inside(folder, folder / RESULT / MESH)
+    path = inside(folder, results_in(folder) / MESH)
     solved = read_ply(path).positions if path.is_file() else np.empty((0, 3))
     return np.array(result.matrix_world, np.float64) @ _object_from_solved(result, solved)
 

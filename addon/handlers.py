@@ -12,7 +12,7 @@ from .mesh_import import remove_preview
 @persistent
 def _before_load(*_: object) -> None:
     """The job belongs to the scene that is left: its result waits on disk."""
-    jobs.detach("Another file was opened meanwhile: find the result with Import Past Job")
+    jobs.detach("Another file was opened meanwhile.")
 
 
 @persistent

@@ -21,19 +21,19 @@ def draw_environment(layout: bpy.types.UILayout, context: bpy.types.Context) -> 
         return
     if state is State.UNKNOWN:
         layout.label(text="Not checked yet", icon="INFO")
-        draw_button(layout, "fewview.check_backend", icon="CHECKMARK", text="Check")
+        draw_button(layout, "fewview.check_backend", icon="CHECKMARK", text="Check Setup")
         return
     layout.label(text="Set up FewView once", icon="INFO")
     draw_text(layout, context, text)
     draw_text(layout, context, "It computes in a Python of its own, which is downloaded for it")
-    draw_button(layout, "fewview.install_backend", icon="IMPORT", text="Set Up...")
+    draw_button(layout, "fewview.install_backend", icon="IMPORT", text="Set Up FewView")
     if not bpy.app.online_access:
         draw_text(layout, context, "Allow Online Access in Preferences > System first", icon="ERROR")
         show = layout.operator("screen.userpref_show", text="Open Preferences", icon="PREFERENCES")
         show.section = "SYSTEM"
     row = layout.row(align=True)
-    row.operator("fewview.check_backend", text="Check Again")
-    row.operator("fewview.copy_install_lines", text="By Hand", icon="COPYDOWN")
+    row.operator("fewview.check_backend")
+    row.operator("fewview.copy_install_lines", icon="COPYDOWN")
 
 
 def draw_running(layout: bpy.types.UILayout, context: bpy.types.Context, job: jobs.RunningJob) -> None:
@@ -69,6 +69,7 @@ def draw_ended(layout: bpy.types.UILayout, context: bpy.types.Context, end: jobs
     row.operator("fewview.dismiss", icon="X", text="", emboss=False)
     if end.failure is not None and not end.cancelled:
         draw_text(layout, context, end.failure.text.partition("\n")[0])
+    if end.failure is not None:
         draw_text(layout, context, end.failure.remedy, icon="FORWARD")
     for text in end.notes:
         draw_text(layout, context, text)

@@ -7,6 +7,7 @@
     PARENT/views-001/           rendered views: images/, transforms.json, truth.ply
     PARENT/points-001/          cloud.ply     points alone
                                 backend.log, result/
+    ANY/                        what the command line made: mesh.ply, report.json and all else of a result/
 
 A job never writes outside its folder, and a name that a backend gives is only taken if it lies inside.
 """
@@ -18,7 +19,6 @@ from pathlib import Path
 from ..backend.wire.protocol import Job, ProtocolError, decode_job, encode_job
 
 JOB_FILE, LOG, RESULT, CLOUD = "job.json", "backend.log", "result", "cloud.ply"
-MESH_FOR_OTHERS = "mesh.glb"
 MESH, RADIANCE, CAMERAS, CAMERAS_PAGE, REPORT_PAGE, REPORT_NUMBERS, SPARSE = (
     "mesh.ply",
     "radiance.npz",
@@ -29,6 +29,8 @@ MESH, RADIANCE, CAMERAS, CAMERAS_PAGE, REPORT_PAGE, REPORT_NUMBERS, SPARSE = (
     "sparse.ply",
 )
 _LARGEST_JOB_BYTES = 1_000_000
+_KIND = "reconstruct"
+"""How the names of such jobs' folders begin."""
 
 
 class FolderError(ValueError):
@@ -37,15 +39,34 @@ class FolderError(ValueError):
 
 @dataclass(frozen=True, kw_only=True)
 class PastJob:
-    """A job on disk that has a mesh."""
+    """A job on disk, as a rule one that has a mesh."""
 
     folder: Path
-    job: Job
+    job: Job | None
+    """What Blender asked for; None for points alone, and for what the command line made."""
 
     @property
     def result(self) -> Path:
         """Folder of the results."""
-        return self.folder / RESULT
+        return results_in(self.folder)
+
+    @property
+    def of_points(self) -> bool:
+        """Whether it is a surface that was fitted to points alone, which have no cameras."""
+        return self.job is None and ((self.folder / CLOUD).is_file() or not (self.result / CAMERAS).is_file())
+
+    @property
+    def words(self) -> str:
+        """What it is, for a list."""
+        if self.job is not None:
+            return f"{self.folder.name}: {self.job.preset}, {len(self.job.images)} images"
+        return f"{self.folder.name}: {'points' if self.of_points else 'from the command line'}"
+
+
+def results_in(folder: Path) -> Path:
+    """Where the results in a job's folder lie: one made by the command line is itself that of the results."""
+    inner = folder / RESULT
+    return inner if inner.is_dir() or not (folder / MESH).is_file() else folder
 
 
 def new_folder(parent: Path, kind: str) -> Path:
@@ -70,6 +91,22 @@ def new_folder(parent: Path, kind: str) -> Path:
         raise FolderError(f"{parent} cannot be written ({error.strerror or error})") from error
 
 
+def folder_for(parent: Path, job: Job) -> Path:
+    """The folder of just this job where it was stopped or failed, for it to go on, or else a new one.
+
+    Raises FolderError where none can be made.
+    """
+    asked = decode_job(encode_job(job))
+    result = CAMERAS if job.until == "cameras" else MESH
+    for folder in sorted(parent.glob(f"{_KIND}-*"), reverse=True):
+        try:
+            if read_job_file(folder) == asked and not (folder / RESULT / result).is_file():
+                return folder
+        except FolderError:
+            continue
+    return new_folder(parent, _KIND)
+
+
 def write_job(folder: Path, job: Job) -> Path:
     """Write job.json; its path."""
     path = folder / JOB_FILE
@@ -87,31 +124,32 @@ def read_job_file(folder: Path) -> Job:
             raise FolderError(f"{path} is too large to be a job")
         return decode_job(path.read_text(encoding="utf-8"))
     except FileNotFoundError as error:
-        text = f"{folder} is not the folder of a job from Blender: it has no {JOB_FILE}"
-        if (folder / MESH).is_file():
-            text += f". What the command line made comes in by File > Import > glTF, {MESH_FOR_OTHERS}"
-        raise FolderError(text) from error
+        raise FolderError(f"{folder} is not the folder of a job: it has no {JOB_FILE}") from error
     except (OSError, UnicodeDecodeError, ProtocolError) as error:
         raise FolderError(f"{path} cannot be read: {error}") from error
 
 
 def read_job(folder: Path) -> PastJob:
-    """The job of a folder that has a mesh. Raises FolderError where there is none or it is damaged."""
+    """The job of a folder that has a mesh. Raises FolderError where there is none or it is damaged.
+
+    Points alone and what the command line made have no job.json: a mesh with its report is one of them.
+    """
+    if folder.name == RESULT and (folder.parent / JOB_FILE).is_file():
+        folder = folder.parent
+    result = results_in(folder)
+    has_mesh = (result / MESH).is_file()
+    if not (folder / JOB_FILE).exists() and has_mesh and (result / REPORT_NUMBERS).is_file():
+        return PastJob(folder=folder, job=None)
     job = read_job_file(folder)
     inside(folder, folder / job.output)
-    if not (folder / RESULT / MESH).is_file():
+    if not has_mesh:
         raise FolderError(f"The job {folder.name} has no mesh yet")
     return PastJob(folder=folder, job=job)
 
 
-def has_fit(folder: Path) -> bool:
-    """Whether it is a folder of points with the surface that was fitted to them; such have no job.json."""
-    return (folder / CLOUD).is_file() and (folder / RESULT / MESH).is_file()
-
-
 def can_be_rendered(folder: Path) -> bool:
     """Whether the folder of a job holds what the backend renders from cameras."""
-    return any((folder / RESULT / name).is_file() for name in (MESH, RADIANCE))
+    return any((results_in(folder) / name).is_file() for name in (MESH, RADIANCE))
 
 
 def past_jobs(parent: Path) -> tuple[PastJob, ...]:

@@ -9,12 +9,15 @@ import signal
 import sys
 import threading
 import time
+import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import bpy
 
+from ..backend.errors import ErrorCode
 from ..backend.wire.client import WireProcess
 from ..backend.wire.protocol import (
     CANCELLED,
@@ -37,6 +40,8 @@ _BUDGET_S = 0.008
 _MESSAGES_PER_TICK = 100
 _REFUSED = "result_refused"
 """Code of a failure on this side: what came back could not be used."""
+_EXPECTED = (FolderError, ValueError, OSError, RuntimeError, MemoryError)
+"""What work on the scene raises with a sentence for the user; anything else is a fault of the program."""
 
 Steps = Iterator[None]
 """Work on the scene in steps that are short enough for a timer."""
@@ -60,6 +65,8 @@ class RunningJob:
     on_end: Callable[[], None] | None
     about_scene: bool
     """Whether what comes back belongs to the file that is open."""
+    remedy: str
+    """How the user gets at its result where that cannot be shown, in a sentence."""
     started_s: float = field(default_factory=time.monotonic)
     stage: str = ""
     stages_before: list[str] = field(default_factory=list)
@@ -146,13 +153,15 @@ def start(
     on_preview: Callable[[Path], Steps] | None = None,
     on_end: Callable[[], None] | None = None,
     about_scene: bool = True,
+    remedy: str = "Start it again.",
     environment: Mapping[str, str] | None = None,
     noisy_start: bool = False,
 ) -> None:
     """Start a job; `follow` must be called next.
 
     `on_finished` and `on_preview` work on the scene in short steps, `on_end` cleans up however the job
-    ended. Raises JobError where a job runs already or this one cannot be started.
+    ended, `remedy` says where its result is if it cannot be shown. Raises JobError where a job runs
+    already or this one cannot be started.
     """
     global _running, _ended, longest_tick_s
     if _running is not None:
@@ -172,6 +181,7 @@ def start(
         on_preview=on_preview,
         on_end=on_end,
         about_scene=about_scene,
+        remedy=remedy,
     )
 
 
@@ -222,8 +232,8 @@ def stop() -> None:
     """End the running job at once: the add-on is switched off."""
     job = _running
     close()
-    if job is not None and job.on_end is not None:
-        job.on_end()
+    if job is not None:
+        _clean_up(job)
     if bpy.app.timers.is_registered(_tick):
         bpy.app.timers.unregister(_tick)
 
@@ -240,7 +250,7 @@ def detach(reason: str) -> None:
     """Let the running job go on without touching the scene: its results stay in its folder."""
     job = _running
     if job is not None and job.about_scene:
-        job.warnings.append(reason)
+        job.warnings.append(f"{reason} {job.remedy}")
         job.on_preview, job.on_finished, job.on_end = None, lambda _: iter(()), None
         job.pending = None if job.pending is None else iter(())
 
@@ -278,6 +288,15 @@ def _advance(deadline: float | None) -> bool:
     job = _running
     if job is None:
         return False
+    try:
+        return _go_on(job, deadline)
+    except Exception as error:  # noqa: BLE001 - the border to Blender: a timer that raises never comes back
+        _end(job, _failed_here(job, error))
+        return True
+
+
+def _go_on(job: RunningJob, deadline: float | None) -> bool:
+    """As `_advance`; raises what the last steps raise."""
     if job.pending is None and not job.finished:
         messages = job.process.poll(_MESSAGES_PER_TICK)
         for message in messages:
@@ -294,18 +313,17 @@ def _advance(deadline: float | None) -> bool:
 
 
 def _step(job: RunningJob) -> None:
-    """One step of work on the scene; a failure in it ends the job, not Blender."""
+    """One step of work on the scene; a preview that fails is left out."""
     assert job.pending is not None
     try:
         next(job.pending)
     except StopIteration:
         job.pending = None
-    except (FolderError, ValueError, OSError, RuntimeError, MemoryError) as error:
+    except Exception as error:
         job.pending = None
         if job.finished:
-            _end(job, _refused(str(error)))
-        else:
-            job.warnings.append(f"A preview could not be shown: {error}")
+            raise
+        job.warnings.append(f"A preview could not be shown: {_words(job, error)}")
 
 
 def _take_in(job: RunningJob, message: Message) -> None:
@@ -342,12 +360,34 @@ def _finishing(job: RunningJob, message: Finished) -> Steps:
     yield from job.on_finished(message)
 
 
-def _refused(text: str) -> Failed:
-    return Failed(
-        code=_REFUSED,
-        text=f"What came back cannot be used: {text}.",
-        remedy="Find it with Import Past Job, or start again; the log may say more.",
-    )
+def _failed_here(job: RunningJob, error: Exception) -> Failed:
+    """What to say of an error on this side."""
+    words = _words(job, error)
+    if isinstance(error, _EXPECTED):
+        text, code = f"What came back cannot be used: {words}.", _REFUSED
+    else:
+        text, code = f"FewView failed unexpectedly: {words}.", ErrorCode.INTERNAL.value
+    return Failed(code=code, text=text, remedy=f"{job.remedy} The log says more: {job.log_path}")
+
+
+def _words(job: RunningJob, error: Exception) -> str:
+    """The error in words; where it is a fault of the program, its trace goes to the log and the console."""
+    if isinstance(error, _EXPECTED) and str(error):
+        return str(error).rstrip(".")
+    trace = "".join(traceback.format_exception(error))
+    sys.stderr.write(trace)
+    with suppress(OSError), job.log_path.open("a", encoding="utf-8") as log:
+        log.write(trace)
+    return f"{type(error).__name__}: {error}".rstrip(": ")
+
+
+def _clean_up(job: RunningJob) -> None:
+    """What the job does at its end, however it ended; a failure in it keeps nobody from the next job."""
+    if job.on_end is not None:
+        try:
+            job.on_end()
+        except Exception as error:  # noqa: BLE001 - the same border
+            job.warnings.append(f"Something of the job was left behind: {_words(job, error)}")
 
 
 def _end(job: RunningJob, failure: Failed | None) -> None:
@@ -356,8 +396,7 @@ def _end(job: RunningJob, failure: Failed | None) -> None:
     # In a thread: a program that has said its last word may take a second to end.
     threading.Thread(target=job.process.close, name="job's end", daemon=True).start()
     _running = None
-    if job.on_end is not None:
-        job.on_end()
+    _clean_up(job)
     _ended = EndedJob(
         title=job.title,
         failure=failure,

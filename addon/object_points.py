@@ -7,10 +7,9 @@ import bpy
 import numpy as np
 from numpy.typing import NDArray
 
+from ..backend.point_methods import FEWEST_POINTS
 from .true_mesh import evaluated_mesh
 
-FEWEST_POINTS = 30
-"""As the backend asks for."""
 WITH_POINTS = frozenset({"MESH", "POINTCLOUD"})
 """Types of objects."""
 _NORMAL = ("normal", "Normal")
@@ -38,11 +37,11 @@ def reason_against(made: bpy.types.Object | None) -> str:
     return ""
 
 
-def points_of(made: bpy.types.Object, *, trust_faces: bool) -> ObjectPoints:
+def points_of(made: bpy.types.Object, *, normals_known: bool) -> ObjectPoints:
     """The object's vertices or points as the viewport has them, modifiers and instances included.
 
-    Normals are those of its attribute `normal`; where there is none and its faces are trusted, theirs.
-    Raises ValueError where nothing is visible, or faces are trusted and there are none.
+    Normals are left out unless they are known: those of its attribute `normal`, or where there is none its
+    faces'. Raises ValueError where nothing is visible, or normals are known and there are none.
     """
     bpy.context.view_layer.update()
     depsgraph = bpy.context.evaluated_depsgraph_get()
@@ -50,32 +49,34 @@ def points_of(made: bpy.types.Object, *, trust_faces: bool) -> ObjectPoints:
     for instance in depsgraph.object_instances:
         owner = (instance.parent if instance.is_instance else instance.object).original
         if owner == made and instance.show_self and instance.object.type in WITH_POINTS:
-            part = _evaluated(instance.object, np.array(instance.matrix_world, np.float64), trust_faces)
+            part = _evaluated(instance.object, np.array(instance.matrix_world, np.float64), normals_known)
             found.append(part)
     found = [part for part in found if len(part.positions)]
     if not found:
         raise ValueError(f"{made.name} has no visible points")
     normals = [part.normals for part in found if part.normals is not None]
-    known = len(normals) == len(found)
-    if trust_faces and not known:
-        raise ValueError(f"{made.name} has no faces that tell normals: switch Normals Are Known off")
+    if normals_known and len(normals) < len(found):
+        raise ValueError(
+            f"{made.name} has neither normals nor faces to tell them: switch Normals Are Known off"
+        )
     return ObjectPoints(
         positions=np.concatenate([part.positions for part in found]),
-        normals=np.concatenate(normals) if known else None,
+        normals=np.concatenate(normals) if normals_known else None,
     )
 
 
-def _evaluated(made: Any, world_from_object: NDArray[np.float64], trust_faces: bool) -> ObjectPoints:
+def _evaluated(made: Any, world_from_object: NDArray[np.float64], normals_known: bool) -> ObjectPoints:
     is_mesh = made.type == "MESH"
     data = made.to_mesh() if is_mesh else made.data
     positions = _vectors(data, "position")
-    normals = next((found for name in _NORMAL if (found := _vectors(data, name)) is not None), None)
+    names = _NORMAL if normals_known else ()
+    normals = next((found for name in names if (found := _vectors(data, name)) is not None), None)
     if is_mesh:
         made.to_mesh_clear()
     rotation = world_from_object[:3, :3]
     if normals is not None:
         normals = _unit(normals @ _cofactors(rotation).T)
-    elif trust_faces and is_mesh:
+    elif normals_known and is_mesh:
         faced = evaluated_mesh(made, world_from_object)
         normals = faced.normals if len(faced.faces) else None
     if positions is None:  # a point cloud without points has no attributes

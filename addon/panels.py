@@ -284,8 +284,8 @@ class FEWVIEW_PT_past_jobs(_Panel, bpy.types.Panel):
         """Each with a button that brings it into the scene."""
         found = past_jobs(jobs_parent(context))[:_MOST_PAST_JOBS]
         for job in found:
-            text = f"{job.folder.name}: {job.job.preset}, {len(job.job.images)} images"
-            self.layout.operator("fewview.import_result", text=text, icon="IMPORT").folder = str(job.folder)
+            shown = self.layout.operator("fewview.import_result", text=job.words, icon="IMPORT")
+            shown.folder = str(job.folder)
         if not found:
             self.layout.label(text="None in the output folder")
 

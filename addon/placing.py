@@ -9,13 +9,6 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-_CERTAIN, _UNCERTAIN = 0.02, 0.002
-"""Spread of the cameras' x axes (second eigenvalue of their mean outer product): that of an arc of 28
-degrees, from which on they alone say what is level, and of 9 degrees, where they say nothing."""
-_RESIDUALS = (0.5, 0.35, 0.25, 0.17, 0.12, 0.1, 0.1, 0.1)
-"""Sines of the roll at which a camera counts a quarter, from a first look to the last."""
-_TIE = 1e-3
-"""Of the backwards axes beside the y axes: decides for cameras that look straight down."""
 _FEWEST_POINTS = 20
 _UNEVEN = 1e-4
 """Relative difference of squared scales; Blender's transforms have seven digits."""
@@ -25,13 +18,13 @@ _LOW = 0.02
 
 
 def upright_from_solved(
-    world_from_camera: Array, centre: Array, radius: float, *, points: Array | None = None
+    world_from_camera: Array, centre: Array, radius: float, *, up: Array, points: Array | None = None
 ) -> Array:
     """(4, 4): similarity that puts what was solved upright into Blender's world.
 
-    `world_from_camera` (cameras, 4, 4), `centre` (3,) and `radius` of the region and the sparse points
-    (points, 3) are in the frame that was solved. There the photographers' horizon becomes level, their
-    mean view looks along +y (the thing shows its front in Blender's front view), the region's radius is
+    `world_from_camera` (cameras, 4, 4), `centre` (3,) and `radius` of the region, the unit vector `up` (3,)
+    and the sparse points (points, 3) are in the frame that was solved. There `up` becomes +z, the mean view
+    looks along +y (the thing shows its front in Blender's front view), the region's radius is
     1 m and its centre lies above the origin. The floor, z = 0, is where the lowest points of the region
     are, but for 2 %; without enough points it is the region's lowest point.
     Raises ValueError where there is no camera or a number is unusable.
@@ -41,7 +34,6 @@ def upright_from_solved(
         raise ValueError("no usable cameras to place the scene by")
     if middle.shape != (3,) or not np.isfinite(middle).all() or not 0 < radius < np.inf:
         raise ValueError(f"the region at {centre} with radius {radius} is not usable")
-    up = up_direction(poses)
     forward = _front(poses, up)
     rotation = np.stack([np.cross(forward, up), forward, up])
     upright = np.eye(4)
@@ -49,29 +41,6 @@ def upright_from_solved(
     upright[:3, 3] = -rotation @ middle / radius
     upright[2, 3] -= _floor(upright, points)
     return upright
-
-
-def up_direction(world_from_camera: Array) -> Array:
-    """(3,): unit vector of the world that is up, for photographs held upright with a level horizon.
-
-    However a level camera is tilted, its x axis is horizontal. So up is the unit vector u with the least
-    sum of w_i (x_i . u)^2, where w_i = (s^2 / (s^2 + (x_i . u)^2))^2 lets a camera that was held in
-    another way than the others count little (Geman and McClure's weights, s falling from 0.5 to 0.1). Its
-    sign is that of the median of the y axes. Where the x axes are nearly parallel, which leaves u free
-    to turn about them, this median decides that, too; in between both have a share.
-    """
-    rotations = np.asarray(world_from_camera, np.float64)[:, :3, :3]
-    rotations = rotations / np.linalg.norm(rotations, axis=1, keepdims=True)
-    x_axes, y_axes, backwards = np.moveaxis(rotations, 2, 0)
-    top = _median_direction(y_axes)
-    up = top
-    for scale in _RESIDUALS:
-        weights = (scale**2 / (scale**2 + (x_axes @ up) ** 2)) ** 2
-        spread, axes = np.linalg.eigh(np.einsum("n,ni,nj->ij", weights / weights.sum(), x_axes, x_axes))
-        share = np.clip((_CERTAIN - spread[1]) / (_CERTAIN - _UNCERTAIN), 0.0, 1.0)
-        along = axes.T @ (top + _TIE * backwards.mean(axis=0)) * [1.0, share, 0.0]
-        up = axes @ along / np.linalg.norm(along)
-    return up
 
 
 def region_in_solved(
@@ -199,13 +168,3 @@ def _floor(upright_from_solved: Array, points: Array | None) -> float:
     placed = np.asarray(points, np.float64) @ upright_from_solved[:3, :3].T + upright_from_solved[:3, 3]
     heights = placed[np.linalg.norm(placed, axis=1) <= 1.0, 2]
     return float(np.quantile(heights, _LOW)) if len(heights) >= _FEWEST_POINTS else -1.0
-
-
-def _median_direction(directions: Array) -> Array:
-    """(3,): unit vector to the geometric median (Weiszfeld's iteration); not moved by a few outliers."""
-    median = directions.mean(axis=0)
-    for _ in range(50):
-        nearness = 1.0 / np.maximum(np.linalg.norm(directions - median, axis=1), 1e-6)
-        median = (nearness[:, None] * directions).sum(axis=0) / nearness.sum()
-    length = float(np.linalg.norm(median))
-    return np.asarray(median / length) if length > 1e-6 else directions[0]

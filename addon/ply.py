@@ -192,7 +192,7 @@ def _mesh(body: bytes, layout: _Layout, name: str) -> PlyMesh:
     assert positions is not None
     for what, values in (("positions", positions), ("normals", normals), ("support", support)):
         if values is not None and not np.isfinite(values).all():
-            raise ValueError(f"{name} has {what} that are no numbers or too large")
+            raise ValueError(f"{name} has {what} that are not finite numbers")
     return PlyMesh(
         positions=positions,
         faces=_faces(body, layout, name),

@@ -14,6 +14,8 @@ from bpy.props import (
     StringProperty,
 )
 
+from ..backend.point_methods import PointMethod
+
 
 class FEWVIEW_PG_image(bpy.types.PropertyGroup):
     """One photograph of the list"""
@@ -178,19 +180,23 @@ class FEWVIEW_PG_settings(bpy.types.PropertyGroup):
             ("nerf", "NeRF", "For comparison: a radiance field, slow and with a rougher mesh"),
             ("neus", "NeuS", "For comparison: a network of distance learned by rendering alone, slow"),
             ("sparsecraft", "SparseCraft", "For comparison: the same with a hash grid and points, slow"),
+            ("neus-published", "NeuS, Full Size", "As published: for a large GPU, and hours of it"),
+            ("sparsecraft-published", "SparseCraft, Full Size", "As published: for a large GPU"),
         ],
         default="balanced",
     )
     device: EnumProperty(
         name="Device",
         items=[
-            ("auto", "Automatic", "The fastest there is"),
+            ("auto", "Automatic", "CUDA where there is one, else the processor"),
             ("cpu", "CPU", "The processor"),
             ("cuda", "CUDA", "A GPU by NVIDIA"),
             ("mps", "MPS", "The GPU of a Mac with Apple silicon"),
         ],
     )
-    seed: IntProperty(name="Seed", description="Of all chance in the reconstruction", default=0, min=0)
+    seed: IntProperty(
+        name="Seed", description="Random seed: the same one gives the same result", default=0, min=0
+    )
     output: StringProperty(
         name="Output",
         description="Folder for jobs; beside the .blend, or the one of the preferences, where this is empty",
@@ -204,20 +210,24 @@ class FEWVIEW_PG_settings(bpy.types.PropertyGroup):
     point_method: EnumProperty(
         name="Method",
         items=[
-            ("linear", "Linear", "The smoothest field that agrees with the points, in seconds"),
+            (PointMethod.LINEAR, "Linear", "The smoothest field that agrees with the points, in seconds"),
             (
-                "neural-pull",
+                PointMethod.NEURAL_PULL,
                 "Neural-Pull",
                 "For comparison: a network that pulls points onto the surface, slow",
             ),
-            ("nap", "NAP", "For comparison: a network pulled from the worst places near its samples, slow"),
-            ("sdro", "SDRO", "For comparison: a network against the worst distribution of samples, slow"),
-            ("entropy", "Entropy", "For comparison: a network that is undecided on the surface alone, slow"),
+            (PointMethod.NAP, "NAP", "For comparison: a network pulled from the worst places nearby, slow"),
+            (PointMethod.SDRO, "SDRO", "For comparison: a network against the worst samples, slow"),
+            (
+                PointMethod.ENTROPY,
+                "Entropy",
+                "For comparison: a network undecided on the surface alone, slow",
+            ),
         ],
     )
     point_normals: BoolProperty(
         name="Normals Are Known",
-        description="The mesh's faces are trusted: the surface shall face as they do",
+        description="The surface shall face as the points' attribute normal says, or else the mesh's faces",
         default=False,
     )
 

@@ -8,7 +8,7 @@ from mathutils import Matrix
 from numpy.typing import NDArray
 
 from .camera_objects import JOB, POINTS, ROLE, world_from_solved
-from .job_folder import CAMERAS, RESULT, inside
+from .job_folder import CAMERAS, inside, results_in
 from .placing import region_in_solved, sphere_around
 from .scenes import in_scene
 from .solved import read_solved
@@ -125,7 +125,7 @@ def _backend_sphere(scene: bpy.types.Scene) -> Sphere | None:
     if not folder:
         return None
     try:
-        solved = read_solved(inside(Path(folder), Path(folder) / RESULT / CAMERAS))
+        solved = read_solved(inside(Path(folder), results_in(Path(folder)) / CAMERAS))
     except ValueError:  # no such job any more: the next best guess
         return None
     if solved.region_centre is None or solved.region_radius is None:

@@ -8,11 +8,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from . import camera_lens, undo_step
-from .camera_objects import POINTS, ROLE, CameraImport, import_steps, objects_of, read_import, root_or_none
-from .frames import frame_owner, has_own_frame, world_from_solved_or_none
-from .job_folder import CAMERAS, MESH, RESULT, PastJob, has_fit, inside, read_job
+from .camera_objects import (
+    POINTS,
+    ROLE,
+    CameraImport,
+    import_steps,
+    objects_of,
+    read_import,
+    root_or_none,
+    upright,
+)
+from .frames import finds_cameras, frame_owner, world_from_solved_or_none
+from .job_folder import CAMERAS, MESH, PastJob, inside, read_job, results_in
 from .mesh_import import MeshImport, import_mesh, read_in_steps
-from .placing import upright_from_solved
 from .scenes import scene_named
 from .solved import SolvedScene, read_solved
 
@@ -30,10 +38,10 @@ def import_result_steps(
     itself. The mesh is read first: where it cannot be used, the scene is left as it is. Raises
     FolderError, ValueError or OSError with a sentence for the user.
     """
-    if has_fit(folder):
-        yield from import_fit_steps(folder, scene_name=scene_name, undo=undo)
-        return
     job = read_job(folder)
+    if job.of_points:
+        yield from import_fit_steps(job.folder, scene_name=scene_name, undo=undo)
+        return
     mesh = yield from read_in_steps(inside(job.folder, job.result / MESH))
     found = _cameras_or_none(job)
     yield
@@ -61,7 +69,7 @@ def import_result_steps(
 
 def import_fit_steps(folder: Path, *, scene_name: str, name: str = "", undo: bool = True) -> Iterator[None]:
     """Import the surface of points, which lie in the world frame, as `import_result_steps` does a job's."""
-    mesh = yield from read_in_steps(inside(folder, folder / RESULT / MESH))
+    mesh = yield from read_in_steps(inside(folder, results_in(folder) / MESH))
     wanted = MeshImport(
         job=str(folder.absolute()), scene_name=scene_name, world_from_solved=np.eye(4), name=name
     )
@@ -72,9 +80,9 @@ def import_fit_steps(folder: Path, *, scene_name: str, name: str = "", undo: boo
 
 def show_estimated_cameras(path: Path, job: PastJob, scene_name: str) -> Iterator[None]:
     """Show cameras that a running job has found, so that its previews have a place; none that were known."""
-    if has_own_frame(job):
-        solved = read_solved(path)
-        yield
+    solved = read_solved(path)
+    yield
+    if solved.estimated and frame_owner(job) == job.folder:
         wanted = CameraImport(
             job=str(job.folder.absolute()), solved=solved, photographs=_photographs(job), points=None
         )
@@ -89,19 +97,20 @@ def world_from_solved(
     Estimated cameras are placed by their root, which the user may have moved; without one they are put
     upright, as a root would be.
     """
-    placed = world_from_solved_or_none(scene, job)
+    placed = world_from_solved_or_none(scene, job, estimated=solved is not None and solved.estimated)
     if placed is not None:
         return placed
-    if solved is None or solved.region_centre is None or solved.region_radius is None:
+    assert solved is not None
+    if solved.region_centre is None or solved.region_radius is None:
         return np.eye(4)
-    return upright_from_solved(solved.poses, np.array(solved.region_centre), solved.region_radius)
+    return upright(solved)
 
 
 def _settle(scene: bpy.types.Scene, job: PastJob) -> None:
     """Hide the points, which would cover the mesh; let the next job use the cameras that this one found."""
     for points in objects_of(scene, str(frame_owner(job).absolute()), POINTS):
         points.hide_viewport = True
-    if has_own_frame(job):
+    if finds_cameras(job):
         scene.fewview.cameras_job = str(job.folder.absolute())
 
 
@@ -125,4 +134,4 @@ def _cameras_or_none(job: PastJob) -> CameraImport | None:
 
 
 def _photographs(job: PastJob) -> tuple[Path, ...]:
-    return tuple(job.folder / image for image in job.job.images)
+    return () if job.job is None else tuple(job.folder / image for image in job.job.images)

@@ -6,14 +6,14 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-from .job_folder import REPORT_NUMBERS, RESULT
+from .job_folder import REPORT_NUMBERS, results_in
 
 _LARGEST_BYTES = 10_000_000
 
 
 def result_lines(job_folder: Path) -> tuple[str, ...]:
     """A few lines about the mesh and, where a truth was given, its error; () where there is no report."""
-    path = job_folder / RESULT / REPORT_NUMBERS
+    path = results_in(job_folder) / REPORT_NUMBERS
     try:
         stat = path.stat()
     except OSError:

@@ -180,9 +180,9 @@ def _unplaced(value: object) -> tuple[str, str]:
 def _number(value: object, name: str) -> float:
     """A finite number that is not too large; JSON's true is none."""
     if isinstance(value, bool) or not isinstance(value, int | float):
-        raise ValueError(f"{name} is {str(value)[:40]!r} and no number")
+        raise ValueError(f"{name} is {str(value)[:40]!r} and not a number")
     if not abs(value) <= LARGEST_LENGTH:  # also for NaN
-        raise ValueError(f"{name} is {str(value)[:40]}, which is no usable number")
+        raise ValueError(f"{name} is {str(value)[:40]}, which is not a finite number of a sensible size")
     return float(value)
 
 

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import bpy
 
-from .job_folder import CAMERAS, RESULT
+from .job_folder import CAMERAS, results_in
 from .operators.images import list_problems
 from .properties import FEWVIEW_PG_settings
 from .scenes import in_scene
@@ -78,7 +78,7 @@ def solved_or_none(settings: FEWVIEW_PG_settings) -> SolvedScene | None:
     """What step 2 found; None where it has not run, or its files are gone."""
     if not settings.cameras_job:
         return None
-    path = Path(bpy.path.abspath(settings.cameras_job)) / RESULT / CAMERAS
+    path = results_in(Path(bpy.path.abspath(settings.cameras_job))) / CAMERAS
     try:
         key = (path, path.stat().st_mtime_ns)
         if key not in _read:

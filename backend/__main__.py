@@ -2,6 +2,7 @@
 
 import argparse
 import faulthandler
+import io
 import logging
 import math
 import sys
@@ -10,6 +11,7 @@ from typing import Any
 
 from . import doctor
 from .commands import install
+from .commands.argument_types import seed
 from .commands.benchmark import add_benchmark, benchmark, positive_seconds
 from .commands.doctor import doctor_on_wire
 from .commands.fit_points import add_fit_points, fit_points_command
@@ -27,6 +29,9 @@ _CAMERA_OPTIONS = ("output", "cameras", "masks", "preset", "seed")
 def main(arguments: list[str] | None = None) -> int:
     """Run a command; the exit code: 0 fine, 1 a fault of the program, 2 of the input, 130 stopped."""
     faulthandler.enable()
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        # As stderr does: a pipe on Windows knows the letters of one language, and folders may have others.
+        sys.stdout.reconfigure(errors="backslashreplace")
     set_waiting_policy()
     logging.basicConfig(level=logging.WARNING, stream=sys.stderr)
     logging.getLogger("backend").setLevel(logging.INFO)
@@ -115,9 +120,9 @@ def _parser() -> argparse.ArgumentParser:
         "--cameras", metavar="FILE_OR_FOLDER", help="transforms.json or COLMAP model; else they are estimated"
     )
     add("--masks", metavar="FOLDER", help="an image per photograph, white on the subject")
-    add("--preset", choices=PRESETS, help="speed against detail (balanced); nerf: a radiance field")
-    add("--device", choices=DEVICES, help="where to compute (auto: the fastest there is)")
-    add("--seed", type=_seed, metavar="N", help="of all chance (0)")
+    add("--preset", choices=PRESETS, help="speed against detail (balanced); others: for comparison")
+    add("--device", choices=DEVICES, help="where to compute (auto: CUDA, else the CPU)")
+    add("--seed", type=seed, metavar="N", help="random seed (0)")
     add("--truth", metavar="MESH", help="true mesh to measure the result against")
     add(
         "--region",
@@ -157,7 +162,7 @@ def _add_cameras(parser: argparse.ArgumentParser) -> None:
     add("--cameras", metavar="FILE_OR_FOLDER", help="cameras to be looked at; else they are estimated")
     add("--masks", metavar="FOLDER", help="an image per photograph, white on the subject")
     add("--preset", choices=PRESETS, help="of a reconstruction that is to go on from here (balanced)")
-    add("--seed", type=_seed, metavar="N", help="of all chance (0)")
+    add("--seed", type=seed, metavar="N", help="random seed (0)")
 
 
 def _add_install(parser: argparse.ArgumentParser) -> None:
@@ -167,13 +172,6 @@ def _add_install(parser: argparse.ArgumentParser) -> None:
     add("--again", action="store_true", help="replace an environment that is ready")
     add("--remove", action="store_true", help="remove the environment instead")
     add("--requirements", metavar="FILE", type=Path, help=argparse.SUPPRESS)
-
-
-def _seed(text: str) -> int:
-    seed = int(text)
-    if not 0 <= seed < 2**31:
-        raise argparse.ArgumentTypeError("must be from 0 to 2147483647")
-    return seed
 
 
 def _number(text: str) -> float:

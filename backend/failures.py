@@ -16,19 +16,19 @@ def explain_or_none(error: Exception) -> ReconstructionError | None:
         return ReconstructionError(
             ErrorCode.MISSING_DEPENDENCY,
             f"A package that the reconstruction needs cannot be loaded: {error}.",
-            "Run `python -m backend doctor` to see what is missing, `pip install .` to install it.",
+            "Check the installation (doctor), which says what is missing, and install it again.",
         )
     if _is_out_of_memory(error):
         return ReconstructionError(
             ErrorCode.OUT_OF_MEMORY,
             "The computer ran out of memory.",
-            "Use a faster preset (--preset fast) or fewer photographs, or close other programs.",
+            "Use a faster preset or fewer photographs, or close other programs.",
         )
     if isinstance(error, OSError) and is_disk_full(error):
         return ReconstructionError(
             ErrorCode.DISK_FULL,
             "The disk is full.",
-            "Free some space and start the same command again; finished stages are kept.",
+            "Free some space and start the same again.",
         )
     return None
 
@@ -38,8 +38,13 @@ def internal_error(error: Exception) -> ReconstructionError:
     return ReconstructionError(
         ErrorCode.INTERNAL,
         f"FewView failed unexpectedly: {type(error).__name__}: {error}",
-        "Please report this with log.txt from the output folder; finished stages are kept.",
+        "Please report this with the log; that of a reconstruction is log.txt in its output folder.",
     )
+
+
+def output_unusable(error: OSError, text: str, remedy: str) -> Exception:
+    """What to raise where the file system refuses to write; a full disk stays what it is."""
+    return error if is_disk_full(error) else ReconstructionError(ErrorCode.OUTPUT_UNUSABLE, text, remedy)
 
 
 def is_disk_full(error: OSError) -> bool:

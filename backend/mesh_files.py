@@ -10,7 +10,7 @@ import struct
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float, Float64, UInt8, UInt16
+from jaxtyping import Bool, Float, Float64, UInt8, UInt16
 
 from .maths.srgb import linear_from_srgb
 from .scene import Region, SurfaceMesh, SurfacePoints, transform_points
@@ -19,7 +19,9 @@ _POINT_FIELDS = [(axis, "<f8") for axis in ("x", "y", "z")] + [(axis, "<f4") for
 _COLOUR_FIELDS = [(channel, "u1") for channel in ("red", "green", "blue")]
 _MESH_VERTEX = np.dtype([*_POINT_FIELDS, *_COLOUR_FIELDS, ("support", "<f4")])
 _CLOUD_VERTEX = np.dtype([*_POINT_FIELDS, *_COLOUR_FIELDS, ("confidence", "<f4")])
-_SPARSE_VERTEX = np.dtype([*_POINT_FIELDS[:3], *_COLOUR_FIELDS])
+_SPARSE_FIELDS = [*_POINT_FIELDS[:3], *_COLOUR_FIELDS]
+_SEEN = "seen_{}"
+"""Names of the bytes whose bits say which photographs show a sparse point, the first in the lowest bit."""
 _FACE = np.dtype([("num_corners", "u1"), ("corners", "<i4", (3,))])
 _PLY_NAMES = {"<f8": "double", "<f4": "float", "|u1": "uchar"}
 
@@ -31,8 +33,11 @@ _GLTF_FLOAT, _GLTF_USHORT, _GLTF_UINT = 5126, 5123, 5125
 _GLTF_VERTICES, _GLTF_INDICES = 34962, 34963
 
 
+SPARSE = "sparse.ply"
+
+
 class MeshFileError(ValueError):
-    """A file that is not a mesh as `mesh_bytes` writes it."""
+    """A file that is not one of those that are written here."""
 
 
 def write_mesh(path: Path, mesh: SurfaceMesh) -> None:
@@ -79,15 +84,41 @@ def write_points(path: Path, points: SurfacePoints, region: Region) -> None:
 
 
 def write_sparse(
-    path: Path, *, positions: Float64[np.ndarray, "points 3"], colours_srgb: UInt8[np.ndarray, "points 3"]
+    path: Path,
+    *,
+    positions: Float64[np.ndarray, "points 3"],
+    colours_srgb: UInt8[np.ndarray, "points 3"],
+    visibility: Bool[np.ndarray, "points photos"],
 ) -> None:
-    """Write sparse.ply: the features that photographs share, world frame, with colours; there may be none."""
-    table = np.zeros(len(positions), _SPARSE_VERTEX)
-    for column, (name, _) in enumerate(_POINT_FIELDS[:3]):
-        table[name] = positions[:, column]
-    for column, (name, _) in enumerate(_COLOUR_FIELDS):
-        table[name] = colours_srgb[:, column]
+    """Write sparse.ply: the features that photographs share, world frame, with colours; there may be none.
+
+    `visibility` says which photographs, in the order of cameras.json, show each.
+    """
+    seen = np.packbits(visibility, axis=1, bitorder="little")
+    table = np.zeros(len(positions), _sparse_layout(visibility.shape[1]))
+    columns = np.hsplit(positions, 3) + np.hsplit(colours_srgb, 3) + np.split(seen, seen.shape[1], axis=1)
+    for name, column in zip(table.dtype.names or (), columns, strict=True):
+        table[name] = column[:, 0]
     path.write_bytes(_header(table, num_faces=None) + table.tobytes())
+
+
+def read_sparse(
+    path: Path, num_photos: int
+) -> tuple[Float64[np.ndarray, "points 3"], Bool[np.ndarray, "points {num_photos}"]]:
+    """Positions and visibility of a file written by write_sparse beside so many cameras.
+
+    Raises MeshFileError for any other file, OSError where it cannot be read.
+    """
+    header, end, body = path.read_bytes().partition(b"end_header\n")
+    layout = _sparse_layout(num_photos)
+    table = np.frombuffer(body[: len(body) // layout.itemsize * layout.itemsize], layout)
+    if len(body) != table.nbytes or header + end != _header(table, num_faces=None):
+        raise MeshFileError(f"{path.name} is cut short, or not of {num_photos} cameras")
+    positions = np.stack([table[axis] for axis in ("x", "y", "z")], axis=-1)
+    if not np.isfinite(positions).all():
+        raise MeshFileError(f"{path.name} has positions that are not finite")
+    seen = np.stack([table[name] for name in (table.dtype.names or ())[len(_SPARSE_FIELDS) :]], axis=-1)
+    return positions, np.unpackbits(seen, axis=1, count=num_photos, bitorder="little").astype(bool)
 
 
 def write_glb(path: Path, mesh: SurfaceMesh) -> None:
@@ -116,6 +147,10 @@ def write_glb(path: Path, mesh: SurfaceMesh) -> None:
         + struct.pack("<I4s", len(binary), b"BIN\0")
         + binary
     )
+
+
+def _sparse_layout(num_photos: int) -> np.dtype[np.void]:
+    return np.dtype([*_SPARSE_FIELDS, *((_SEEN.format(i), "u1") for i in range(-(-num_photos // 8)))])
 
 
 def _vertex_table(

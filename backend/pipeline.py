@@ -10,7 +10,7 @@ import platform
 import time
 import typing
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache, partial
 from importlib.metadata import version
 from itertools import takewhile
@@ -19,26 +19,29 @@ from types import MappingProxyType
 
 import torch
 
+from .errors import ErrorCode, ReconstructionError
 from .machine import choose_device, peak_memory_bytes, set_up_torch
 from .maths.metrics import load_truth
+from .mesh_files import SPARSE
 from .presets import Settings
 from .previews import Previews
-from .results import cameras_summary, summary, write_all, write_cameras
-from .scene import Decision, Photo, Region, SolvedCameras, SurfaceMesh, View
+from .results import cameras_summary, check_no_mesh_of_others, summary, write_all, write_cameras
+from .scene import Decision, Photo, Region, SolvedCameras, StereoResult, SurfaceMesh, View
 from .stages.camera_refinement import match_solved, with_refined
 from .stages.camera_report import build_camera_report
 from .stages.cameras import solve_cameras
 from .stages.mesh import extract_mesh
 from .stages.neus_fit import NeusConfig, fit_neus
-from .stages.photos import load_photos
+from .stages.photos import load_photos, match_masks, named_photos
 from .stages.radiance_field import Radiance
 from .stages.radiance_fit import RadianceConfig, fit_radiance
 from .stages.region import find_region
 from .stages.report import Report, ReportInputs, StageTiming, build_report
-from .stages.stereo import StereoResult
-from .stages.train import Surface, TrainConfig, fit_surface
+from .stages.surface import Surface
+from .stages.train import TrainConfig, fit_surface
 from .version import VERSION
-from .workspace import StageCost, Workspace, check_free_space, fingerprint
+from .wire.photographs import passed_over, passed_over_text
+from .workspace import StageCost, Workspace, check_free_space, content_of, fingerprint
 
 T = typing.TypeVar("T")
 CHECKPOINTED = ("photos", "cameras", "region", "stereo", "train", "mesh")
@@ -46,9 +49,36 @@ STAGE_NAMES = (*CHECKPOINTED, "report")
 _UNTIL = {"cameras": ("photos", "cameras", "region"), "report": STAGE_NAMES}
 """The stages of a run, by what it is asked for."""
 _CAMERA_FILES = frozenset({".json", ".txt", ".bin"})
-_BYTES_PER_PHOTO = 60_000_000
-"""On disk while a run goes on: the photograph, its undistorted twin, depth and normals, as floats."""
+_BYTES_PER_PIXEL = MappingProxyType({"photos": 16, "cameras": 24, "stereo": 40})
+"""On disk, of each photograph: with its mask; its undistorted twin and what cameras are found by; depth and
+points. Measured: 12 to 16, 14 to 18, 8 to 23."""
+_SHORT_BY_LONG_SIDE = 0.75
+"""Of most photographs; the others are a little narrower."""
 _BYTES_FOR_RESULTS = 200_000_000
+_COMPUTING_FOLDERS = ("kernels", "maths", "stages")
+_COMPUTING_MODULES = (
+    "errors.py",
+    "images.py",
+    "machine.py",
+    "mesh_files.py",
+    "pipeline.py",
+    "point_methods.py",
+    "scene.py",
+    "wire/photographs.py",
+)
+_PACKAGES = (
+    "torch",
+    "numba",
+    "pycolmap",
+    "numpy",
+    "scipy",
+    "scikit-image",
+    "trimesh",
+    "embreex",
+    "fast-simplification",
+    "pillow",
+)
+"""All that compute, or read photographs."""
 
 logger = logging.getLogger(__name__)
 
@@ -140,6 +170,15 @@ class Listener(typing.Protocol):
 
 
 @dataclass(frozen=True, kw_only=True)
+class _Files:
+    """The photographs and masks as files of today, by the photographs' names."""
+
+    photos: typing.Mapping[str, Path]
+    photo_contents: typing.Mapping[str, str]
+    mask_contents: typing.Mapping[str, str]
+
+
+@dataclass(frozen=True, kw_only=True)
 class _Run:
     """One pass over the stages."""
 
@@ -201,32 +240,68 @@ def run(job: Job, workspace: Workspace, *, settings: Settings, stages: Stages, l
     """Reconstruct, going on where an earlier run of the same job stopped.
 
     Raises ReconstructionError for what the user can mend and Cancelled where the listener does; then the
-    results of an earlier run are as they were.
+    results of an earlier run are as they were. A folder about other photographs is such a thing, and one with
+    a mesh that would not fit the cameras, where these alone are asked for.
     """
     if job.truth is not None:
         load_truth(job.truth)  # better told now than after minutes of work
     device = choose_device(job.device)
     set_up_torch(device)
-    fingerprints = stage_fingerprints(job, settings, device.type)
+    files = _files(job)
+    fingerprints = stage_fingerprints(job, files, settings, device.type)
+    frame = fingerprints["cameras"]
+    workspace.claim("photographs", files.photo_contents.values())
+    if job.until == "cameras":
+        check_no_mesh_of_others(workspace, frame)
     names = _UNTIL[job.until]
     finished = _finished(workspace, fingerprints, names)
     if finished:
         listener.resumed(finished)
-    check_free_space(workspace.folder, _needed_bytes(job))
+    to_come = set(names) - set(finished)
+    check_free_space(workspace.folder, _needed_bytes(len(files.photos), to_come, settings))
     this = _Run(workspace=workspace, listener=listener, fingerprints=fingerprints, stage_names=names)
-    solved, region = _placed(job, this, settings, stages)
+    solved, region = _placed(job, files, this, settings, stages)
     if job.until == "cameras":
         name = job.output.resolve().name
-        told = build_camera_report(solved, region, job_name=name, seed=job.seed, versions=_versions())
-        return Outcome(files=write_cameras(told, workspace), summary=cameras_summary(told))
+        told = build_camera_report(solved, region, job_name=name, seed=job.seed, versions=versions())
+        return Outcome(files=write_cameras(told, workspace, frame=frame), summary=cameras_summary(told))
     inputs, radiance = _reconstructed(job, this, settings, stages, placed=(solved, region, device))
     report = this.unkept_stage("report", partial(stages.build_report, inputs, settings.report))
-    return Outcome(files=write_all(report, radiance, workspace), summary=summary(report))
+    return Outcome(files=write_all(report, radiance, workspace, frame=frame), summary=summary(report))
 
 
-def _placed(job: Job, this: _Run, settings: Settings, stages: Stages) -> tuple[SolvedCameras, Region]:
+def _files(job: Job) -> _Files:
+    """The job's photographs and masks.
+
+    Raises ReconstructionError: NO_PHOTOS, TOO_FEW_PHOTOS, MASK_UNUSABLE, PHOTO_UNREADABLE.
+    """
+    photos = named_photos(job.images)
+    masks = {} if job.masks is None else match_masks(tuple(photos), job.masks)
+    return _Files(
+        photos=photos,
+        photo_contents={name: _content(path) for name, path in photos.items()},
+        mask_contents={name: _content(path) for name, path in masks.items()},
+    )
+
+
+def _content(path: Path) -> str:
+    try:
+        return content_of(path)
+    except OSError as error:  # no leave to read it, or a cloud's placeholder without a connection
+        text = f"{path.name} cannot be read ({error.strerror or error})."
+        remedy = "Make it readable on this computer, or leave it out."
+        raise ReconstructionError(ErrorCode.PHOTO_UNREADABLE, text, remedy) from error
+
+
+def _placed(
+    job: Job, files: _Files, this: _Run, settings: Settings, stages: Stages
+) -> tuple[SolvedCameras, Region]:
     """Where each photograph was taken, and what of the world is to be reconstructed."""
+    if text := passed_over_text(passed_over([source for source in job.images if source.is_dir()])):
+        this.warn(text)
     photos = this.stage("photos", partial(stages.load_photos, job.images, job.masks, settings.photos))
+    # Those of an earlier run are where the folder was then.
+    photos = tuple(replace(photo, path=files.photos[photo.name]) for photo in photos)
     scratch = {"workdir": this.workspace.emptied_sfm_folder(), "seed": job.seed}
     solve = partial(stages.solve_cameras, photos, job.cameras, settings.cameras, **scratch)
     solved = this.stage("cameras", solve)
@@ -271,15 +346,21 @@ def _reconstructed(
         points=stereo.points,
         mesh=mesh,
         truth=job.truth,
-        versions=_versions(),
+        versions=versions(),
     )
     return inputs, surface.radiance
 
 
-def stage_fingerprints(job: Job, settings: Settings, device_kind: str) -> dict[str, str]:
+def stage_fingerprints(job: Job, files: _Files, settings: Settings, device_kind: str) -> dict[str, str]:
     """For each stage, a name of all it depends on; a stage after a changed one changes too."""
     own: dict[str, tuple[object, ...]] = {
-        "photos": (code_fingerprint(), *job.images, "masks", job.masks, settings.photos),
+        "photos": (
+            code_fingerprint(),
+            sorted(files.photo_contents.items()),
+            "masks" if job.masks else None,
+            sorted(files.mask_contents.items()),
+            settings.photos,
+        ),
         "cameras": (*_camera_files(job.cameras), job.seed, settings.cameras),
         "region": (settings.region,),
         "stereo": (device_kind, settings.stereo),
@@ -295,11 +376,18 @@ def stage_fingerprints(job: Job, settings: Settings, device_kind: str) -> dict[s
 
 @cache
 def code_fingerprint() -> str:
-    """Changes with the code that computes results, so that no result of older code is taken for new."""
+    """Changes with the code that computes results, so that no result of older code is taken for new.
+
+    Packages belong to it: another version of one may round otherwise, or decide otherwise.
+    """
+    return fingerprint(sorted(versions().items()), *computing_sources())
+
+
+def computing_sources() -> tuple[Path, ...]:
+    """The files whose code decides what a kept stage gives."""
     here = Path(__file__).parent
-    folders = [*(here / "maths").rglob("*.py"), *(here / "stages").rglob("*.py")]
-    sources = [here / "scene.py", here / "images.py", *folders]
-    return fingerprint(*sorted(sources))
+    folders = (path for name in _COMPUTING_FOLDERS for path in (here / name).rglob("*.py"))
+    return tuple(sorted([*(here / name for name in _COMPUTING_MODULES), *folders]))
 
 
 def _finished(workspace: Workspace, fingerprints: dict[str, str], names: tuple[str, ...]) -> tuple[str, ...]:
@@ -311,14 +399,14 @@ def _finished(workspace: Workspace, fingerprints: dict[str, str], names: tuple[s
 def _camera_files(cameras: Path | None) -> list[Path | str]:
     """The files that may hold the given cameras; their images are among the photographs."""
     if cameras is None or not cameras.is_dir():
-        return ["cameras", *([cameras] if cameras else [])]
+        return ["cameras", *([cameras, cameras.with_name(SPARSE)] if cameras else [])]
     return sorted(path for path in cameras.rglob("*") if path.suffix in _CAMERA_FILES)
 
 
-def _needed_bytes(job: Job) -> int:
-    """About what the run will write: generous, because a full disk ends it after minutes of work."""
-    num_photos = sum(len(list(path.iterdir())) if path.is_dir() else 1 for path in job.images)
-    return _BYTES_FOR_RESULTS + num_photos * _BYTES_PER_PHOTO
+def _needed_bytes(num_photos: int, to_come: typing.Collection[str], settings: Settings) -> int:
+    """About what these stages will write: generous, because a full disk ends them after minutes of work."""
+    num_pixels = num_photos * round(settings.photos.max_side_px**2 * _SHORT_BY_LONG_SIDE)
+    return _BYTES_FOR_RESULTS + num_pixels * sum(_BYTES_PER_PIXEL.get(name, 0) for name in to_come)
 
 
 def _warn_of_unplaced(solved: SolvedCameras, num_photos: int, this: _Run) -> None:
@@ -333,7 +421,6 @@ def _decisions(*results: typing.Any) -> tuple[Decision, ...]:
     return tuple(dict.fromkeys(found))
 
 
-def _versions() -> dict[str, str]:
+def versions() -> dict[str, str]:
     """What the result depends on, with versions."""
-    packages = ("torch", "pycolmap", "scikit-image", "numpy")
-    return {"FewView": VERSION, "Python": platform.python_version(), **{n: version(n) for n in packages}}
+    return {"FewView": VERSION, "Python": platform.python_version(), **{n: version(n) for n in _PACKAGES}}

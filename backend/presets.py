@@ -1,6 +1,7 @@
 """Named settings as data: how much time a run takes, and for what detail."""
 
-from dataclasses import dataclass, field
+import math
+from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 
 from .stages.cameras import CamerasConfig
@@ -31,6 +32,18 @@ class Settings:
     report: ReportConfig = field(default_factory=ReportConfig)
 
 
+_SPARSECRAFT = NeusConfig(
+    network=NetworkConfig(layers=1, colour_layers=3, hash_grid=HashConfig(), albedo_and_specular=True),
+    sampling=Sampling(rays=128, uniform=16, rounds=2),
+    weights=Weights(points=1.0),
+    learning_rate=1e-2,
+    warm_up=0.0,
+    constant=0.5,
+    last_rate=0.1,
+    exponential=True,
+    slope_annealed_at=1.0,
+)
+
 PRESETS = MappingProxyType(
     {
         "fast": Settings(
@@ -55,16 +68,45 @@ PRESETS = MappingProxyType(
         "neus": Settings(photos=PhotosConfig(max_side_px=800), stereo=None, train=NeusConfig()),
         "sparsecraft": Settings(
             photos=PhotosConfig(max_side_px=800),
+            train=_SPARSECRAFT,
+        ),
+        "neus-published": Settings(
+            photos=PhotosConfig(max_side_px=1600),
+            stereo=None,
             train=NeusConfig(
+                steps=300_000,
                 network=NetworkConfig(
-                    layers=1, colour_layers=3, hash_grid=HashConfig(), albedo_and_specular=True
+                    width=256,
+                    layers=8,
+                    features=256,
+                    colour_layers=4,
+                    frequencies=6,
+                    longest_wave=2 * math.pi,
+                    direction_frequencies=4,
                 ),
-                sampling=Sampling(rays=128, uniform=16, rounds=2),
-                weights=Weights(points=1.0),
-                learning_rate=1e-2,
-                constant=0.5,
-                slope_annealed_at=1.0,
+                sampling=Sampling(rays=512, uniform=64, rounds=4, per_round=16),
+                learning_rate=5e-4,
+                sharpness_rate=5e-3,
+                constant=1 / 60,
+                nodes=512,
             ),
+            mesh=MeshConfig(max_faces=500_000),
+        ),
+        "sparsecraft-published": Settings(
+            photos=PhotosConfig(max_side_px=1600),
+            train=replace(
+                _SPARSECRAFT,
+                steps=4000,
+                network=replace(
+                    _SPARSECRAFT.network,
+                    features=13,
+                    spherical_harmonics=True,
+                    hash_grid=HashConfig(levels=32, finest=2048, most_rows=2**19),
+                ),
+                sampling=Sampling(rays=1024, uniform=64, rounds=4, per_round=16, point_queries=5000),
+                nodes=512,
+            ),
+            mesh=MeshConfig(max_faces=500_000),
         ),
     }
 )

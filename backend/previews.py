@@ -13,7 +13,7 @@ from .mesh_files import write_mesh, write_points
 from .scene import Region, SolvedCameras, SurfacePoints, transform_points
 from .stages.mesh import preview_mesh
 from .stages.nerfstudio import transforms_json
-from .stages.train import Surface
+from .stages.surface import Surface
 from .workspace import Workspace
 
 _SHORTEST_PAUSE_S = 1.0

@@ -15,6 +15,8 @@ from pathlib import Path
 
 import numpy as np
 
+from .held_files import when_let_go
+
 T = typing.TypeVar("T")
 _STRUCTURE = "structure"
 _PLAIN = (str, int, float, bool)
@@ -39,7 +41,7 @@ def save_record(path: Path, record: object, hint: object, *, note: str = "") -> 
         np.savez(file, allow_pickle=False, **members)
         file.flush()
         os.fsync(file.fileno())
-    part.replace(path)
+    when_let_go(lambda: part.replace(path))
 
 
 def load_record(path: Path, hint: type[T]) -> T:

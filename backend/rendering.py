@@ -36,7 +36,7 @@ def render_job(job: Path, cameras: Path, output: Path, device: str, progress: Pr
         raise ReconstructionError(
             ErrorCode.OUTPUT_UNUSABLE,
             f"{output} holds the results of a reconstruction.",
-            "Choose a new or empty folder for --output.",
+            "Choose a new or empty output folder.",
         )
     writers: Writers = {}
     for number, (name, camera) in enumerate(named.items()):
@@ -44,6 +44,7 @@ def render_job(job: Path, cameras: Path, output: Path, device: str, progress: Pr
         writers[name] = partial(_write, draw=draw, camera=camera, progress=_named(tell, name))
     with open_workspace(output) as workspace:
         try:
+            workspace.claim("pictures")
             workspace.write_results(writers)
         except (ReconstructionError, Cancelled):
             workspace.discard_if_nothing_done()

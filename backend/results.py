@@ -5,8 +5,9 @@ from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
+from .errors import ErrorCode, ReconstructionError
 from .maths.sampling import mean_colours
-from .mesh_files import write_glb, write_mesh, write_points, write_sparse
+from .mesh_files import SPARSE, write_glb, write_mesh, write_points, write_sparse
 from .records import save_record
 from .scene import Region, SolvedCameras
 from .stages.camera_report import CameraReport, camera_report_html, camera_report_numbers
@@ -21,10 +22,17 @@ Writers = dict[str, Callable[[Path], object]]
 
 RADIANCE = "radiance.npz"
 """A radiance field that was fitted, to render from: no pickle, arrays and JSON."""
+_OF_WHOLE_RUNS = ("mesh.ply", "mesh.glb", "points.ply", "report.json", "report.html", RADIANCE)
+_CAMERA_PAGES = ("cameras_report.json", "cameras.html")
 
 
-def write_all(report: Report, radiance: Radiance | None, workspace: Workspace) -> tuple[str, ...]:
-    """Put all results in place; their names."""
+def write_all(
+    report: Report, radiance: Radiance | None, workspace: Workspace, *, frame: str
+) -> tuple[str, ...]:
+    """Put all results in place; their names. `frame` is the fingerprint of the cameras.
+
+    Pages about other cameras, which an earlier run left, are removed.
+    """
     inputs = report.inputs
     writers: Writers = {
         "mesh.ply": partial(write_mesh, mesh=inputs.mesh),
@@ -36,18 +44,33 @@ def write_all(report: Report, radiance: Radiance | None, workspace: Workspace) -
     }
     if radiance is not None:
         writers[RADIANCE] = partial(save_record, record=radiance, hint=Radiance)
-    workspace.write_results(writers, replaced=(RADIANCE,))
+    outdated = () if workspace.frame == frame else _CAMERA_PAGES
+    workspace.write_results(writers, replaced=(RADIANCE, *outdated), frame=frame)
     return (*writers, LOG)
 
 
-def write_cameras(report: CameraReport, workspace: Workspace) -> tuple[str, ...]:
-    """Put in place what is known once the cameras are; the names."""
+def check_no_mesh_of_others(workspace: Workspace, frame: str) -> None:
+    """ReconstructionError(OUTPUT_UNUSABLE) where cameras of their own would stand beside an earlier mesh.
+
+    `frame` is the fingerprint of the cameras to come.
+    """
+    if workspace.frame == frame or not any((workspace.folder / name).exists() for name in _OF_WHOLE_RUNS):
+        return
+    raise ReconstructionError(
+        ErrorCode.OUTPUT_UNUSABLE,
+        f"{workspace.folder} holds a mesh of other cameras, photographs or settings; these would not fit it.",
+        "Choose another output folder, or reconstruct into this one, which replaces the mesh as well.",
+    )
+
+
+def write_cameras(report: CameraReport, workspace: Workspace, *, frame: str) -> tuple[str, ...]:
+    """Put in place what is known once the cameras are; the names. `frame` is their fingerprint."""
     writers: Writers = {
         **_camera_writers(report.solved, report.region),
         "cameras_report.json": _text(_json(camera_report_numbers(report))),
         "cameras.html": _text(camera_report_html(report)),
     }
-    workspace.write_results(writers)
+    workspace.write_results(writers, frame=frame)
     return (*writers, LOG)
 
 
@@ -84,10 +107,11 @@ def cameras_summary(report: CameraReport) -> tuple[str, ...]:
 
 
 def _camera_writers(solved: SolvedCameras, region: Region) -> Writers:
-    colours = mean_colours(solved.views, solved.sparse_positions, solved.sparse_visibility)
+    positions, visibility = solved.sparse_positions, solved.sparse_visibility
+    colours = mean_colours(solved.views, positions, visibility)
     return {
         "cameras.json": _text(_json(transforms_json(solved, region))),
-        "sparse.ply": partial(write_sparse, positions=solved.sparse_positions, colours_srgb=colours),
+        SPARSE: partial(write_sparse, positions=positions, colours_srgb=colours, visibility=visibility),
     }
 
 

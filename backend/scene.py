@@ -153,7 +153,7 @@ class SolvedCameras:
     """One for each view: what its photograph was taken with before the distortion was removed."""
     unplaced: tuple[Unplaced, ...]
     estimated: bool
-    """False where the cameras were given."""
+    """False where the cameras were given, but for those that FewView estimated in an earlier job."""
     sparse_positions: Float64[np.ndarray, "points 3"]
     """Triangulated features, world frame; empty where the cameras were given without any."""
     sparse_visibility: Bool[np.ndarray, "points views"]
@@ -208,6 +208,31 @@ class SurfacePoints:
         for name in ("positions", "normals", "colours_srgb", "confidence"):
             if not np.isfinite(getattr(self, name)).all():
                 raise ValueError(f"{name} of surface points hold numbers that are not finite")
+
+
+@dataclass(frozen=True, kw_only=True)
+class DepthMap:
+    """What one photograph measured; full image size, object frame."""
+
+    depth: Float32[np.ndarray, "height width"]
+    """Along the camera's axis, object units; 0 where nothing was measured."""
+    confidence: Float32[np.ndarray, "height width"]
+    """0 to 1."""
+    empty: Bool[np.ndarray, "height width"] | None
+    """Where the photograph, if it has no mask, shows nothing but an even backdrop; None where it has none."""
+    subject: Bool[np.ndarray, "height width"] | None
+    """Where something surely stands before that backdrop."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class StereoResult:
+    """Points of the surface and the depth maps they come from, one per view."""
+
+    points: SurfacePoints
+    depth_maps: tuple[DepthMap, ...]
+    refined_cameras: tuple[Camera, ...] | None = None
+    """One per view; None where those that stereo was given are as good."""
+    decisions: tuple[Decision, ...] = ()
 
 
 @dataclass(frozen=True, kw_only=True)

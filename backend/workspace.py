@@ -1,8 +1,9 @@
 """The output folder: whose it is, what is finished in it, and how results appear there.
 
     DIR/                      results, all put in place together at the end; log.txt
-    DIR/.fewview/             format.json (the sign that the folder is ours), one `<stage>.npz` for each
-                              finished stage with the fingerprint of all it depends on, lock, sfm/
+    DIR/.fewview/             format.json (the sign that the folder is ours, and what it is for), one
+                              `<stage>.npz` for each finished stage with the fingerprint of all it depends
+                              on, lock, sfm/
 
 Nothing outside of these names is ever written, replaced or removed.
 """
@@ -11,15 +12,17 @@ import hashlib
 import json
 import logging
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, Literal, TypeVar
 
 from .errors import ErrorCode, ReconstructionError
-from .failures import is_disk_full
+from .failures import output_unusable
 from .file_lock import lock
+from .held_files import when_let_go
 from .records import RecordUnreadable, load_record, read_note, save_record
 
 T = TypeVar("T")
@@ -29,7 +32,16 @@ LOG = "log.txt"
 _FORMAT_FILE = "format.json"
 _LOCK = "lock"
 _PARTS = "results"
+_REPLACED = "replaced"
 _SFM = "sfm"
+Purpose = Literal["photographs", "points", "pictures"]
+"""What a folder is for: what becomes of photographs, of points alone, or pictures of a finished job."""
+_WORDS: dict[object, str] = {
+    "photographs": "a reconstruction from photographs",
+    "points": "a surface that was fitted to points",
+    "pictures": "pictures of a finished job",
+}
+_ANOTHER_FOLDER = "Choose a new or empty output folder."
 _NOBODYS = frozenset({".DS_Store", "Thumbs.db", "desktop.ini"})
 """Files that file browsers leave behind."""
 
@@ -73,10 +85,32 @@ class Workspace:
 
     def emptied_sfm_folder(self) -> Path:
         """Scratch folder for the camera solver, without what a killed run may have left in it."""
-        folder = self.private / _SFM
-        shutil.rmtree(folder, ignore_errors=True)
-        folder.mkdir()
-        return folder
+        return self._emptied(_SFM)
+
+    def claim(self, purpose: Purpose, photographs: Iterable[str] = ()) -> None:
+        """Note what the folder is for and, by their contents, which photographs it is about.
+
+        ReconstructionError(OUTPUT_UNUSABLE), and nothing noted, where it is for something else, or about
+        photographs of which none is among these: what is in it would be lost.
+        """
+        note = self._read_note()
+        # Before it was noted, photographs alone had checkpoints.
+        before = note.get("purpose", "photographs" if any(self.private.glob("*.npz")) else purpose)
+        wanted, known = set(photographs), set(note.get("photographs", ()))
+        if before != purpose:
+            text = f"{self.folder} holds {_WORDS[before]}."
+            raise ReconstructionError(ErrorCode.OUTPUT_UNUSABLE, text, _ANOTHER_FOLDER)
+        if known and not known & wanted:
+            text = f"{self.folder} holds a reconstruction from other photographs."
+            remedy = f"{_ANOTHER_FOLDER} To use this one again, remove what is in it first."
+            raise ReconstructionError(ErrorCode.OUTPUT_UNUSABLE, text, remedy)
+        self._write_note({**note, "purpose": purpose, "photographs": sorted(wanted)})
+
+    @property
+    def frame(self) -> str | None:
+        """Fingerprint of the cameras in whose frame the results in the folder are; None where unknown."""
+        frame: str | None = self._read_note().get("frame")
+        return frame
 
     def is_finished(self, stage: str, fingerprint: str) -> bool:
         """Whether the stage was finished from exactly the same inputs."""
@@ -87,7 +121,10 @@ class Workspace:
         """Keep the result of a stage."""
         memory = cost.peak_memory_bytes
         note = f"{fingerprint} {cost.seconds:.6f} {'-' if memory is None else memory}"
-        save_record(self._stage_path(stage), record, hint, note=note)
+        try:
+            save_record(self._stage_path(stage), record, hint, note=note)
+        except OSError as error:
+            raise _not_writable(self.folder, error) from error
 
     def load_or_none(self, stage: str, fingerprint: str, hint: type[T]) -> tuple[T, StageCost] | None:
         """The result of a stage that was finished from the same inputs; None where it must be redone."""
@@ -103,22 +140,43 @@ class Workspace:
             return None
 
     def write_results(
-        self, writers: dict[str, Callable[[Path], object]], *, replaced: tuple[str, ...] = ()
+        self,
+        writers: dict[str, Callable[[Path], object]],
+        *,
+        replaced: tuple[str, ...] = (),
+        frame: str | None = None,
     ) -> None:
         """Write every result under another name, then put all in place together.
 
-        Results of these names that an earlier run left, and this one has not, are removed.
+        Results of the names in `replaced` that an earlier run left, and this one has not, are removed.
+        `frame` is what the property says from then on. Raises ReconstructionError(OUTPUT_UNUSABLE) where an
+        earlier result can not be replaced, as one that is open on Windows; then all are as they were.
         """
-        parts = self.private / _PARTS
-        shutil.rmtree(parts, ignore_errors=True)
-        parts.mkdir()
+        parts, earlier = self._emptied(_PARTS), self._emptied(_REPLACED)
         for name, write in writers.items():
             write(parts / name)
-        for name in writers:
-            (parts / name).replace(self.folder / name)
-        for name in set(replaced) - writers.keys():
-            (self.folder / name).unlink(missing_ok=True)
-        parts.rmdir()
+        touched: list[str] = []
+        try:
+            for name in (*writers, *sorted(set(replaced) - writers.keys())):
+                if (self.folder / name).exists():
+                    when_let_go(partial((self.folder / name).replace, earlier / name))
+                touched.append(name)
+                if name in writers:
+                    when_let_go(partial((parts / name).replace, self.folder / name))
+        except OSError as error:
+            self._put_back(touched, earlier)
+            raise _not_replaced(self.folder / name, error) from error
+        shutil.rmtree(parts, ignore_errors=True)
+        shutil.rmtree(earlier, ignore_errors=True)
+        # Last: after a kill before it, what is in the folder is taken for that of other cameras.
+        self._write_note({**self._read_note(), "frame": frame})
+
+    def discard_stages(self) -> None:
+        """Remove what only a run that goes on needs: finished stages, scratch files and previews."""
+        self.remove_previews()
+        shutil.rmtree(self.private / _SFM, ignore_errors=True)
+        for path in self.private.glob("*.npz"):
+            path.unlink()
 
     def discard_if_nothing_done(self) -> None:
         """Remove what opening made, where no stage was finished and nothing else is there."""
@@ -133,6 +191,40 @@ class Workspace:
 
     def _stage_path(self, stage: str) -> Path:
         return self.private / f"{stage}.npz"
+
+    def _emptied(self, name: str) -> Path:
+        """Folder of that name for what is on its way, without what a killed run may have left in it."""
+        folder = self.private / name
+        shutil.rmtree(folder, ignore_errors=True)
+        folder.mkdir(exist_ok=True)
+        return folder
+
+    def _put_back(self, names: list[str], earlier: Path) -> None:
+        """Undo what was done to the results of these names."""
+        for name in names:
+            with suppress(OSError):  # the others shall come back all the same
+                if (earlier / name).exists():
+                    (earlier / name).replace(self.folder / name)
+                else:
+                    (self.folder / name).unlink(missing_ok=True)
+
+    def _read_note(self) -> dict[str, Any]:
+        """What format.json says."""
+        note: dict[str, Any] = json.loads((self.private / _FORMAT_FILE).read_text(encoding="utf-8"))
+        return note
+
+    def _write_note(self, note: dict[str, Any]) -> None:
+        _write_format(self.private, note)
+
+
+def _write_format(private: Path, note: dict[str, Any]) -> None:
+    """Write format.json whole or not at all; ReconstructionError(OUTPUT_UNUSABLE) where it can not be."""
+    part = private / (_FORMAT_FILE + ".part")
+    try:
+        part.write_text(json.dumps(note) + "\n", encoding="utf-8")
+        when_let_go(lambda: part.replace(private / _FORMAT_FILE))
+    except OSError as error:
+        raise _not_writable(private.parent, error) from error
 
 
 @contextmanager
@@ -156,12 +248,8 @@ def open_workspace(folder: Path) -> Iterator[Workspace]:
                 f"Another run is writing to {folder}.",
                 "Wait until it ends, or choose another output folder.",
             )
-        try:
-            marker = private / (_FORMAT_FILE + ".part")
-            marker.write_text(json.dumps({"program": "fewview", "format": FORMAT}) + "\n")
-            marker.replace(private / _FORMAT_FILE)
-        except OSError as error:
-            raise _not_writable(folder, error) from error
+        if not (private / _FORMAT_FILE).is_file():
+            _write_format(private, {"program": "fewview", "format": FORMAT})
         yield Workspace(folder=folder)
 
 
@@ -173,7 +261,8 @@ def check_free_space(folder: Path, needed_bytes: int) -> None:
             ErrorCode.DISK_FULL,
             f"{free / 1e9:.1f} GB are free on the disk of {folder}; "
             f"this run needs about {needed_bytes / 1e9:.1f} GB.",
-            "Free some space, choose an output folder on another disk, or use a faster preset.",
+            "Free some space, choose an output folder on another disk, or use fewer photographs or a faster "
+            "preset.",
         )
 
 
@@ -183,24 +272,28 @@ def fingerprint(*parts: object) -> str:
     for part in parts:
         if isinstance(part, Path):
             for path in _files_of(part):
-                digest.update(f"\0file {path.name}\0".encode())
-                with path.open("rb") as file:
-                    digest.update(hashlib.file_digest(file, "sha256").digest())
+                digest.update(f"\0file {path.name}\0{content_of(path)}\0".encode())
         else:
             digest.update(f"\0{part!r}\0".encode())
     return digest.hexdigest()[:32]
 
 
+def content_of(path: Path) -> str:
+    """A short name of what is in the file."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()[:32]
+
+
 def _files_of(path: Path) -> list[Path]:
-    """The file, or the files right in the folder; none where there is nothing."""
+    """The file, or the files right in the folder but for file browsers' own; none where there is nothing."""
     if path.is_dir():
-        return sorted(entry for entry in path.iterdir() if entry.is_file())
+        return sorted(entry for entry in path.iterdir() if entry.is_file() and entry.name not in _NOBODYS)
     return [path] if path.is_file() else []
 
 
 def _check_ours(folder: Path) -> None:
     """ReconstructionError(OUTPUT_UNUSABLE) where writing into the folder could hurt somebody's files."""
-    remedy = "Choose a new or empty folder for --output."
+    remedy = _ANOTHER_FOLDER
     try:
         if not folder.exists():
             return
@@ -220,7 +313,7 @@ def _check_ours(folder: Path) -> None:
             ErrorCode.OUTPUT_UNUSABLE, f"{folder} holds files that FewView did not make ({shown}).", remedy
         )
     try:
-        found = json.loads(marker.read_text()).get("format")
+        found = json.loads(marker.read_text(encoding="utf-8")).get("format")
     except (OSError, ValueError, AttributeError):
         found = None
     if found != FORMAT:
@@ -229,12 +322,19 @@ def _check_ours(folder: Path) -> None:
         )
 
 
+def _not_replaced(result: Path, error: OSError) -> Exception:
+    """What to raise where an earlier result stands in the way of a new one."""
+    return output_unusable(
+        error,
+        f"{result} can not be replaced ({error.strerror or error}); all results are as they were.",
+        f"Close the program that has {result.name} open and start the same command again; finished stages "
+        "are kept.",
+    )
+
+
 def _not_writable(folder: Path, error: OSError) -> Exception:
-    """What to raise for an error of the file system; a full disk stays what it is."""
-    if is_disk_full(error):
-        return error
-    return ReconstructionError(
-        ErrorCode.OUTPUT_UNUSABLE,
+    return output_unusable(
+        error,
         f"{folder} cannot be written ({error.strerror or error}).",
-        "Choose a folder for --output that you may write to.",
+        "Choose an output folder that you may write to.",
     )

@@ -1,11 +1,17 @@
 """What the measurements of chosen cases have in common: where cases lie, where results go."""
 
 import argparse
-from collections.abc import Sequence
+import multiprocessing
+from collections.abc import Callable, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
+from typing import Any, TypeVar
 
 from backend.benchmark.suites import Case, Suite, find_cases
+from backend.waiting import set_waiting_policy
 from backend.wire.protocol import DEVICES
+
+T = TypeVar("T")
 
 
 def add_places(parser: argparse.ArgumentParser) -> None:
@@ -25,3 +31,10 @@ def chosen_cases(
     if found.missing:
         parser.error(f"files are missing of {', '.join(found.missing)}")
     return found.cases
+
+
+def alone(work: Callable[..., T], *arguments: Any) -> T:
+    """The result from a new process, which holds nothing of this one; its threads wait as those of a run."""
+    set_waiting_policy()
+    with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as pool:
+        return pool.submit(work, *arguments).result()

@@ -4,7 +4,8 @@
 
 The clouds of the shared data as they are, and 1024 points drawn from their true surfaces with noise. Poisson
 (that of pycolmap) gets normals from neighbours, made consistent along a spanning tree, where none are given.
-Leaves table.md and results.json, written anew after every fit; what is in results.json is not measured again.
+Leaves table.md and results.json, written anew after every fit; what is in results.json is not measured again,
+but a network after other steps is.
 """
 
 import argparse
@@ -25,13 +26,14 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import breadth_first_order, connected_components, minimum_spanning_tree
 
 from backend.benchmark.summary import markdown
-from backend.commands.fit_points import POINT_METHODS
 from backend.errors import ReconstructionError
 from backend.machine import choose_device, set_up_torch
 from backend.maths.metrics import TrueSurface, load_truth, surface_error
 from backend.maths.nearest import nearest_tree
 from backend.maths.neighbours import neighbour_planes
+from backend.point_methods import PointMethod
 from backend.scene import SurfaceMesh, no_progress
+from backend.stages import point_network
 from backend.stages.mesh import MeshConfig, vertex_normals
 from backend.stages.point_cloud import PointCloud, clean_cloud, read_cloud
 from backend.stages.point_fit import PointFitConfig, fit_points
@@ -40,7 +42,7 @@ from backend.stages.point_network import NetworkConfig
 
 NAMES = ("anchor", "00011084", "00016513", "00994122")
 NOISE_PERCENT = (0.0, 0.5, 2.5)
-METHODS = ("poisson", *POINT_METHODS)
+METHODS = ("poisson", *(method.value for method in PointMethod))
 _SPARSE = 1024
 _SAMPLES = 50_000
 """On either side: two equal surfaces differ by about 0.2 % of the diagonal then."""
@@ -141,19 +143,24 @@ def consistent_normals(positions: np.ndarray) -> np.ndarray:
     return normals
 
 
+def place_of(case: str, method: str, steps: int) -> dict[str, object]:
+    """Where a result stands among the others; only a network's depends on the steps."""
+    return {"case": case, "method": method, "steps": steps if method in point_network.METHODS else None}
+
+
 def measured(case: Case, method: str, steps: int) -> dict[str, object]:
     """A method's seconds and error on a case, or why there are none."""
+    place = place_of(case.name, method, steps)
     began_s = time.perf_counter()
     try:
         mesh = poisson(case) if method == "poisson" else _fitted(case, method, steps)
     except ReconstructionError as error:
-        return {"case": case.name, "method": method, "failure": str(error)}
+        return {**place, "failure": str(error)}
     seconds = time.perf_counter() - began_s
     whole = surface_error(mesh, case.truth, cameras=None, seed=0, num_samples=_SAMPLES).whole
     closed = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).is_watertight
     return {
-        "case": case.name,
-        "method": method,
+        **place,
         "seconds": round(seconds, 1),
         "chamfer_percent": whole.chamfer_percent,
         "f_score_at_one_percent": whole.f_score_at_one_percent,
@@ -164,7 +171,7 @@ def measured(case: Case, method: str, steps: int) -> dict[str, object]:
 
 def _fitted(case: Case, method: str, steps: int) -> SurfaceMesh:
     config = PointFitConfig(
-        method=method, normals_known=case.normals_known, network=NetworkConfig(steps=steps)
+        method=PointMethod(method), normals_known=case.normals_known, network=NetworkConfig(steps=steps)
     )
     surface = fit_points(
         case.cloud,
@@ -176,8 +183,12 @@ def _fitted(case: Case, method: str, steps: int) -> SurfaceMesh:
     return mesh_of_points(surface, case.cloud, MeshConfig(), progress=no_progress)
 
 
-def table(results: list[dict[str, object]]) -> str:
-    """Markdown: Chamfer % / F@1% and seconds, a row for each case, a column for each method."""
+def table(results: list[dict[str, object]], steps: int) -> str:
+    """Markdown: Chamfer % / F@1% and seconds, a row for each case, a column for each method.
+
+    Of the networks what they were after so many steps.
+    """
+    results = [row for row in results if row["steps"] in (None, steps)]
     methods = [method for method in METHODS if any(row["method"] == method for row in results)]
     by_place = {(row["case"], row["method"]): row for row in results}
     rows = []
@@ -205,22 +216,23 @@ def main() -> int:
     add("--output", metavar="DIR", type=Path, required=True)
     add("--clouds", nargs="+", choices=NAMES, default=list(NAMES))
     add("--methods", nargs="+", choices=METHODS, default=list(METHODS))
-    add("--steps", type=int, metavar="N", default=500, help="of the networks (500)")
+    steps = NetworkConfig.steps
+    add("--steps", type=int, metavar="N", default=steps, help=f"of the networks ({steps}, as fit-points)")
     parsed = words.parse_args()
     logging.basicConfig(level=logging.INFO, format="%(message)s", stream=sys.stderr)
     set_up_torch(choose_device("cpu"))
     parsed.output.mkdir(parents=True, exist_ok=True)
     path = parsed.output / "results.json"
     results = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else []
-    known = {(row["case"], row["method"]) for row in results}
+    known = [{key: row[key] for key in ("case", "method", "steps")} for row in results]
     for case in cases(parsed.data, parsed.clouds):
         for method in parsed.methods:
-            if (case.name, method) not in known:
+            if place_of(case.name, method, parsed.steps) not in known:
                 results.append(measured(case, method, parsed.steps))
                 logger.info("%s", results[-1])
                 path.write_text(json.dumps(results, indent=2) + "\n", encoding="utf-8")
-                (parsed.output / "table.md").write_text(table(results), encoding="utf-8")
-    sys.stdout.write(table(results))
+                (parsed.output / "table.md").write_text(table(results, parsed.steps), encoding="utf-8")
+    sys.stdout.write(table(results, parsed.steps))
     return 0
 
 

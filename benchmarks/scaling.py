@@ -9,15 +9,13 @@ results.json, written anew after every sweep.
 import argparse
 import json
 import logging
-import multiprocessing
 import sys
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict
 from pathlib import Path
 
-from backend.benchmark.scaling import SWEEPS, Cost, Setup, exponents, least, measure, table, verdict
+from backend.benchmark.scaling import SWEEPS, Cost, exponents, least, measure, table, verdict
 from backend.benchmark.suites import CASES, Case
-from benchmarks.chosen import add_places, chosen_cases
+from benchmarks.chosen import add_places, alone, chosen_cases
 
 logger = logging.getLogger(__name__)
 
@@ -46,18 +44,12 @@ def main() -> int:
         for setup in SWEEPS[sweep]:
             if sweep == "views" and setup.num_views > len(case.given):
                 continue
-            costs = [_measured_alone(case, folder, setup, parsed.device) for _ in range(parsed.repeats)]
+            costs = [alone(measure, case, folder, setup, parsed.device) for _ in range(parsed.repeats)]
             done[sweep].append(least(costs))
             logger.info("%s: %s", sweep, done[sweep][-1].sizes[sweep])
         _write(parsed.output, case, done)
     sys.stdout.write((parsed.output / "table.md").read_text(encoding="utf-8"))
     return 0
-
-
-def _measured_alone(case: Case, folder: Path, setup: Setup, device_kind: str) -> Cost:
-    """Measured in a new process, which holds nothing of this one."""
-    with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as pool:
-        return pool.submit(measure, case, folder, setup, device_kind).result()
 
 
 def _write(output: Path, case: Case, done: dict[str, list[Cost]]) -> None:

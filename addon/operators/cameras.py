@@ -1,4 +1,4 @@
-"""Step 2: find the cameras, show them, look through them."""
+"""Step 2: estimate the cameras, show them, look through them."""
 
 from collections.abc import Iterator
 from functools import partial
@@ -8,12 +8,13 @@ import bpy
 from bpy.props import StringProperty
 
 from ...backend.wire.client import backend_command
+from ...backend.wire.photographs import is_named
 from ...backend.wire.protocol import PROTOCOL_VERSION, Job
 from .. import camera_objects, jobs, undo_step
 from ..arguments import absolute, argument, fill_in
-from ..job_folder import LOG, RESULT, FolderError, new_folder, read_job_file, write_job
+from ..job_folder import LOG, RESULT, FolderError, folder_for, read_job_file, write_job
 from ..properties import settings_of
-from ..scenes import scene_name_of
+from ..scenes import scene_name_of, scene_named
 from .environment import backend_python_or_reason
 from .images import used_images
 from .reconstruct import jobs_parent
@@ -23,7 +24,7 @@ class FEWVIEW_OT_estimate_cameras(bpy.types.Operator):
     """Find where the photographs were taken, or read their known cameras, and show them in the scene"""
 
     bl_idname = "fewview.estimate_cameras"
-    bl_label = "Find Cameras"
+    bl_label = "Estimate Cameras"
 
     images: StringProperty(
         name="Photographs",
@@ -59,13 +60,14 @@ class FEWVIEW_OT_estimate_cameras(bpy.types.Operator):
             if python is None:
                 raise ValueError(reason)
             job = self._job(context)
-            folder = new_folder(jobs_parent(context, self.output), "reconstruct")
+            folder = folder_for(jobs_parent(context, self.output), job)
             jobs.start(
-                "Finding cameras",
+                "Loading cameras" if job.cameras else "Estimating cameras",
                 backend_command(python, "reconstruct", str(write_job(folder, job))),
                 folder=folder,
                 log_path=folder / LOG,
                 on_finished=partial(_on_finished, context.scene.session_uid, folder),
+                remedy="Press Estimate Cameras again.",
             )
         except (ValueError, OSError, jobs.JobError) as error:
             self.report({"ERROR"}, str(error))
@@ -91,6 +93,7 @@ class FEWVIEW_OT_estimate_cameras(bpy.types.Operator):
             device=self.device,
             seed=self.seed,
             until="cameras",
+            keep_stages=False,
         )
 
 
@@ -113,7 +116,7 @@ class FEWVIEW_OT_import_cameras(bpy.types.Operator):
         chosen = self.folder or settings_of(context).cameras_job
         try:
             if not chosen:
-                raise ValueError("There is no job folder: choose one, or find cameras first")
+                raise ValueError("There is no job folder: choose one, or estimate the cameras first")
             warnings: list[str] = []
             for _ in show_cameras(context.scene.name, Path(absolute(chosen)), warnings):
                 pass
@@ -156,7 +159,7 @@ class FEWVIEW_OT_show_photograph(bpy.types.Operator):
 
     photograph: StringProperty(
         name="Photograph",
-        description="Its file name; the active one of the list where this is empty",
+        description="Its file, or the end of the path; the active one of the list where this is empty",
         options={"SKIP_SAVE"},
     )
 
@@ -164,7 +167,7 @@ class FEWVIEW_OT_show_photograph(bpy.types.Operator):
     def poll(cls, context: bpy.types.Context) -> bool:
         """There must be cameras to look through."""
         if not camera_objects.cameras_with_photographs(context.scene):
-            cls.poll_message_set("Find the cameras first")
+            cls.poll_message_set("Estimate the cameras first")
             return False
         return True
 
@@ -173,11 +176,14 @@ class FEWVIEW_OT_show_photograph(bpy.types.Operator):
         scene, settings = context.scene, settings_of(context)
         name = self.photograph
         if not name and 0 <= settings.active_image < len(settings.images):
-            name = Path(settings.images[settings.active_image].path).name
-        camera = camera_objects.camera_of_photograph(scene, name)
-        if camera is None:
-            missing = f"{name} has no camera: choose another photograph" if name else "Choose a photograph"
-            self.report({"ERROR"}, missing)
+            name = bpy.path.abspath(settings.images[settings.active_image].path)
+        try:
+            camera = camera_objects.camera_of_photograph(scene, name)
+            if camera is None:
+                missing = f"{Path(name).name} has no camera: choose another photograph"
+                raise ValueError(missing if name else "Choose a photograph")
+        except ValueError as error:
+            self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
         scene.camera = camera
         width, height = camera.get(camera_objects.SIZE, (0, 0))
@@ -196,13 +202,12 @@ def show_cameras(scene_name: str, folder: Path, warnings: list[str]) -> Iterator
     wanted = camera_objects.read_import(folder, _photographs(folder, scene_name))
     yield
     yield from camera_objects.import_steps(scene_name, wanted)
-    settings = bpy.data.scenes[scene_name].fewview
+    settings = scene_named(scene_name).fewview
     settings.cameras_job = str(folder)
-    reasons = dict(wanted.solved.unplaced)
     for image in settings.images:
-        name = Path(bpy.path.abspath(image.path)).name
-        if name in reasons:
-            image.problem = reasons[name]
+        path = Path(bpy.path.abspath(image.path))
+        why = next((why for name, why in wanted.solved.unplaced if is_named(path, name)), "")
+        image.problem = why or image.problem
     warnings += [f"{name} could not be placed: {why}" for name, why in wanted.solved.unplaced]
     warnings += camera_objects.problems(wanted)
 
@@ -213,7 +218,7 @@ def _on_finished(scene_uid: int, folder: Path, _: object) -> Iterator[None]:
     job = jobs.running()
     if job is not None:
         job.warnings += [text for text in warnings if text not in job.warnings]
-    undo_step.push("Find Cameras")
+    undo_step.push("Estimate Cameras")
 
 
 def _photographs(folder: Path, scene_name: str) -> tuple[Path, ...]:
@@ -221,7 +226,7 @@ def _photographs(folder: Path, scene_name: str) -> tuple[Path, ...]:
     try:
         return tuple(folder / image for image in read_job_file(folder).images)
     except FolderError:
-        return used_images(bpy.data.scenes[scene_name].fewview)
+        return used_images(scene_named(scene_name).fewview)
 
 
 def _look_through(context: bpy.types.Context) -> None:

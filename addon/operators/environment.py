@@ -13,7 +13,7 @@ from .. import environment, jobs
 from ..environment import PythonMissing, State
 from ..preferences import preferences_of
 
-_ONLINE = "Allow Online Access in the preferences' System tab, or make the environment by hand"
+_ONLINE = "Allow Online Access in Preferences > System first, or Set Up by Hand"
 _BUSY = "Wait until the running job ends, or cancel it"
 _BUILDS = [
     ("PREFERENCES", "As in the Preferences", "The build that is chosen there"),
@@ -33,10 +33,13 @@ def backend_python_or_reason(context: bpy.types.Context) -> tuple[Path | None, s
     except PythonMissing as error:
         return None, str(error)
     if found is None:
-        return None, "Install the backend in the add-on's preferences, or choose a Python there"
+        return None, "FewView is not set up: press Set Up FewView, or choose a Python in the preferences"
     known = environment.readiness(found.path)
     if known.state is State.NOT_READY:
-        return None, f"The backend is not ready ({known.text}): check or install it in the preferences"
+        return (
+            None,
+            f"FewView is not set up ({known.text}): press Set Up FewView, or Check Setup if that has changed",
+        )
     return found.path, ""
 
 
@@ -53,7 +56,7 @@ def backend_state(context: bpy.types.Context) -> tuple[State, str]:
     except PythonMissing as error:
         return State.NOT_READY, str(error)
     if found is None:
-        return State.NOT_READY, "Not installed"
+        return State.NOT_READY, "Not set up yet"
     known = environment.readiness(found.path)
     return known.state, known.text
 
@@ -74,10 +77,10 @@ def user_folder(name: str = "", *, create: bool = False) -> Path:
 
 
 class FEWVIEW_OT_check_backend(bpy.types.Operator):
-    """Check that the backend's Python has all that a reconstruction needs"""
+    """Check that FewView's Python has all that a reconstruction needs"""
 
     bl_idname = "fewview.check_backend"
-    bl_label = "Check Backend"
+    bl_label = "Check Setup"
 
     python: StringProperty(
         name="Python",
@@ -104,18 +107,19 @@ class FEWVIEW_OT_check_backend(bpy.types.Operator):
             return {"CANCELLED"}
         if found is None:
             self.report(
-                {"ERROR"}, "There is no backend yet: install it, or choose a Python in the preferences"
+                {"ERROR"},
+                "FewView is not set up: press Set Up FewView, or choose a Python in the preferences",
             )
             return {"CANCELLED"}
         command = environment.doctor_command(found.path)
-        return _run(self, "Check Backend", command, python=found.path)
+        return _run(self, "Checking the setup", command, python=found.path)
 
 
 class FEWVIEW_OT_install_backend(bpy.types.Operator):
-    """Make an environment of its own for the backend: a Python with torch and all else that it needs"""
+    """Make a Python of its own for FewView, with torch and all else that a reconstruction needs"""
 
     bl_idname = "fewview.install_backend"
-    bl_label = "Install Backend"
+    bl_label = "Set Up FewView"
 
     build: EnumProperty(name="Compute On", items=_BUILDS, options={"SKIP_SAVE"})
     folder: StringProperty(
@@ -142,7 +146,7 @@ class FEWVIEW_OT_install_backend(bpy.types.Operator):
         """Ask first."""
         self.build = preferences_of(context).torch_build
         return context.window_manager.invoke_props_dialog(
-            self, width=450, title="Install Backend", confirm_text="Install"
+            self, width=450, title="Set Up FewView", confirm_text="Set Up"
         )
 
     def draw(self, context: bpy.types.Context) -> None:
@@ -168,7 +172,7 @@ class FEWVIEW_OT_install_backend(bpy.types.Operator):
         command = environment.install_command(
             sys.executable, folder, build=self._build(context), again=self.again
         )
-        return _run(self, "Install Backend", command, python=python_in(folder), folder=folder)
+        return _run(self, "Setting up FewView", command, python=python_in(folder), folder=folder)
 
     def _build(self, context: bpy.types.Context) -> str:
         return preferences_of(context).torch_build if self.build == "PREFERENCES" else self.build
@@ -180,10 +184,10 @@ class FEWVIEW_OT_install_backend(bpy.types.Operator):
 
 
 class FEWVIEW_OT_remove_backend(bpy.types.Operator):
-    """Remove the environment that the add-on made for the backend"""
+    """Remove the Python that Set Up FewView made"""
 
     bl_idname = "fewview.remove_backend"
-    bl_label = "Remove Backend"
+    bl_label = "Remove Setup"
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
@@ -198,7 +202,7 @@ class FEWVIEW_OT_remove_backend(bpy.types.Operator):
         return context.window_manager.invoke_confirm(
             self,
             event,
-            title="Remove Backend",
+            title="Remove Setup",
             message=str(managed_folder(context)),
             confirm_text="Remove",
             icon="WARNING",
@@ -214,7 +218,7 @@ class FEWVIEW_OT_copy_install_lines(bpy.types.Operator):
     """Copy two lines for a shell that make the environment by hand"""
 
     bl_idname = "fewview.copy_install_lines"
-    bl_label = "Copy Install Lines"
+    bl_label = "Set Up by Hand"
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         """Put them on the clipboard."""

@@ -9,10 +9,10 @@ from typing import ClassVar
 import bpy
 from bpy.props import CollectionProperty, StringProperty
 
+from ...backend.wire.photographs import SUFFIXES, passed_over, passed_over_text, photographs_in
 from ..image_header import size_or_none
 from ..properties import FEWVIEW_PG_settings, settings_of
 
-EXTENSIONS = (".jpg", ".jpeg", ".png", ".tif", ".tiff")
 MOST_IMAGES = 1000
 _SMALL_PX = 640
 
@@ -65,11 +65,6 @@ def list_problems(settings: FEWVIEW_PG_settings) -> tuple[str, ...]:
     return tuple(problems)
 
 
-def images_in(folder: Path) -> list[Path]:
-    """The image files of a folder, by name. Raises OSError where it cannot be read."""
-    return sorted(path for path in folder.iterdir() if path.suffix.lower() in EXTENSIONS and path.is_file())
-
-
 class FEWVIEW_OT_add_images(bpy.types.Operator):
     """Add photographs to the list; without a selection, all of the folder"""
 
@@ -80,7 +75,7 @@ class FEWVIEW_OT_add_images(bpy.types.Operator):
     filepath: StringProperty(subtype="FILE_PATH", options={"SKIP_SAVE"})
     directory: StringProperty(subtype="DIR_PATH", options={"SKIP_SAVE"})
     files: CollectionProperty(type=bpy.types.OperatorFileListElement, options={"SKIP_SAVE", "HIDDEN"})
-    filter_glob: StringProperty(default=";".join(f"*{e}" for e in EXTENSIONS), options={"HIDDEN"})
+    filter_glob: StringProperty(default=";".join(f"*{e}" for e in SUFFIXES), options={"HIDDEN"})
 
     def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> set[str]:
         """Open the file browser, unless files were dropped."""
@@ -92,16 +87,19 @@ class FEWVIEW_OT_add_images(bpy.types.Operator):
     def execute(self, context: bpy.types.Context) -> set[str]:
         """Add what was chosen."""
         try:
-            paths = self._paths()
+            paths, left_out = self._paths()
         except FileNotFoundError as error:
             self.report({"ERROR"}, f"{error.filename} is not there: choose another file or folder")
             return {"CANCELLED"}
         except OSError as error:
             self.report({"ERROR"}, f"The folder cannot be read: {error.strerror or error}")
             return {"CANCELLED"}
+        skipped = passed_over_text(left_out)
         if not paths:
-            self.report({"ERROR"}, f"There are no images ({', '.join(EXTENSIONS)}): choose others")
+            self.report({"ERROR"}, skipped or f"There are no images ({', '.join(SUFFIXES)}): choose others")
             return {"CANCELLED"}
+        if skipped:
+            self.report({"WARNING"}, skipped)
         settings = settings_of(context)
         num_new = add_images(settings, paths)
         settings.source = "FILES"
@@ -110,10 +108,13 @@ class FEWVIEW_OT_add_images(bpy.types.Operator):
         self.report({"INFO"}, f"{num_new} photographs added")
         return {"FINISHED"}
 
-    def _paths(self) -> list[Path]:
-        """The image files that are meant. Raises OSError where one, or the folder, cannot be read."""
+    def _paths(self) -> tuple[list[Path], tuple[str, ...]]:
+        """The photographs that are meant, and the names of pictures that are none.
+
+        Raises OSError where one, or the folder, cannot be read.
+        """
         if not self.directory and not self.filepath:
-            return []  # not the folder that Blender was started in
+            return [], ()  # not the folder that Blender was started in
         folder = Path(bpy.path.abspath(self.directory)) if self.directory else None
         names = [file.name for file in self.files if file.name]
         if folder is not None and names:
@@ -126,8 +127,8 @@ class FEWVIEW_OT_add_images(bpy.types.Operator):
         for path in chosen:
             if not path.exists():
                 raise FileNotFoundError(ENOENT, strerror(ENOENT), str(path))
-            found += images_in(path) if path.is_dir() else [path]
-        return [path.absolute() for path in found if path.suffix.lower() in EXTENSIONS]
+            found += sorted(photographs_in(path)) if path.is_dir() else [path]
+        return [path.absolute() for path in found if path.suffix.lower() in SUFFIXES], passed_over(chosen)
 
 
 class _OnList:
@@ -177,7 +178,7 @@ class FEWVIEW_FH_images(bpy.types.FileHandler):
     bl_idname = "FEWVIEW_FH_images"
     bl_label = "FewView Photographs"
     bl_import_operator = "fewview.add_images"
-    bl_file_extensions = ";".join(EXTENSIONS)
+    bl_file_extensions = ";".join(SUFFIXES)
 
     @classmethod
     def poll_drop(cls, context: bpy.types.Context) -> bool:

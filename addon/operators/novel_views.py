@@ -14,7 +14,7 @@ from ..arguments import absolute, argument, fill_in
 from ..camera_lens import pinhole_of, world_from_camera
 from ..camera_objects import JOB, selected_cameras
 from ..frames import world_from_result
-from ..job_folder import LOG, RESULT, can_be_rendered, inside, new_folder
+from ..job_folder import LOG, can_be_rendered, inside, new_folder, results_in
 from ..placing import solved_from_camera
 from ..properties import settings_of
 from ..result_mesh import result_or_none
@@ -143,10 +143,11 @@ def _start(python: Path, job: Path, folder: Path, device: str) -> None:
     words = ("--cameras", str(folder / TRANSFORMS), "--output", str(folder / IMAGES), "--device", device)
     jobs.start(
         "Rendering novel views",
-        backend_command(python, "render", str(inside(job, job / RESULT)), *words, "--wire"),
+        backend_command(python, "render", str(inside(job, results_in(job))), *words, "--wire"),
         folder=folder,
         log_path=folder / LOG,
         on_finished=on_finished,
+        remedy=f"The pictures are in {folder / IMAGES}.",
     )
 
 

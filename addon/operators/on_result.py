@@ -8,7 +8,7 @@ from bpy.props import StringProperty
 from ..result_mesh import result_or_none
 
 Status = set[str]
-RECONSTRUCT_FIRST = "Reconstruct first, or import a past job"
+RECONSTRUCT_FIRST = "Reconstruct first, or bring a result back from Past Jobs"
 
 
 def has_result(cls: Any, context: bpy.types.Context) -> bool:

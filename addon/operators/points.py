@@ -15,7 +15,7 @@ from ..properties import settings_of
 from ..result_import import import_fit_steps
 from ..scenes import scene_name_of
 from .environment import backend_python_or_reason, reason_against_a_job
-from .reconstruct import jobs_parent
+from .reconstruct import IN_PAST_JOBS, jobs_parent
 
 
 class FEWVIEW_OT_fit_points(bpy.types.Operator):
@@ -54,11 +54,11 @@ class FEWVIEW_OT_fit_points(bpy.types.Operator):
         try:
             if python is None:
                 raise ValueError(reason)
-            points = points_of(context.active_object, trust_faces=self.normals_known)
+            points = points_of(context.active_object, normals_known=self.normals_known)
             folder = new_folder(jobs_parent(context, self.output), "points")
             write_points(folder / CLOUD, points.positions, points.normals)
             words = ["--method", self.method, "--device", self.device, "--seed", str(self.seed)]
-            if points.normals is not None:
+            if self.normals_known:
                 words.append("--normals-known")
             _start(python, folder, words, context)
         except (ValueError, jobs.JobError, OSError) as error:
@@ -85,6 +85,7 @@ def _start(python: Path, folder: Path, words: list[str], context: bpy.types.Cont
         folder=folder,
         log_path=folder / LOG,
         on_finished=on_finished,
+        remedy=IN_PAST_JOBS,
     )
 
 

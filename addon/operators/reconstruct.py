@@ -7,11 +7,21 @@ import bpy
 from bpy.props import FloatVectorProperty, StringProperty
 
 from ...backend.wire.client import backend_command
+from ...backend.wire.photographs import photographs_in
 from ...backend.wire.protocol import PROTOCOL_VERSION, Finished, Job
 from .. import jobs
 from ..arguments import absolute, argument, fill_in
 from ..frames import world_from_solved_or_none
-from ..job_folder import CAMERAS, LOG, RESULT, PastJob, new_folder, write_job
+from ..job_folder import (
+    CAMERAS,
+    LOG,
+    RESULT,
+    PastJob,
+    folder_for,
+    read_job_file,
+    results_in,
+    write_job,
+)
 from ..mesh_import import MeshImport, remove_preview, show_preview
 from ..preferences import preferences_of
 from ..properties import FEWVIEW_PG_settings, settings_of
@@ -26,6 +36,8 @@ from .images import used_images
 
 _LOG_TEXT = "fewview_log"
 """Custom property of the text block with the log."""
+IN_PAST_JOBS = "Past Jobs in step 5 has the result, or start again."
+"""Where it is if it could not be shown."""
 
 
 def jobs_parent(context: bpy.types.Context, given: str = "") -> Path:
@@ -53,19 +65,28 @@ def cameras_for(settings: FEWVIEW_PG_settings, images: Sequence[Path]) -> str | 
         return absolute(settings.cameras_path)
     if not settings.cameras_job:
         return None
-    path = Path(bpy.path.abspath(settings.cameras_job)) / RESULT / CAMERAS
+    folder = Path(bpy.path.abspath(settings.cameras_job))
+    path = results_in(folder) / CAMERAS
     try:
-        solved = read_solved(path)
+        read_solved(path)
+        looked_at = photographs_of(folder)
     except (ValueError, OSError):
         return None  # the user has moved or removed it: they are found again
-    known = {camera.name for camera in solved.cameras} | {name for name, _ in solved.unplaced}
-    if {path.name for path in images} <= known:
+    if {path.absolute() for path in images} <= looked_at:
         return str(path)
     if settings.region is None:
         return None
     raise ValueError(
         "The region belongs to cameras without the new photographs: estimate them again in step 2"
     )
+
+
+def photographs_of(folder: Path) -> set[Path]:
+    """The files that a job looked at. Raises FolderError where job.json is gone, OSError where they are."""
+    found: set[Path] = set()
+    for source in (folder / image for image in read_job_file(folder).images):
+        found.update(photographs_in(source) if source.is_dir() else [source])
+    return {path.absolute() for path in found}
 
 
 class FEWVIEW_OT_reconstruct(bpy.types.Operator):
@@ -115,7 +136,7 @@ class FEWVIEW_OT_reconstruct(bpy.types.Operator):
             if python is None:
                 raise ValueError(reason)
             asked = self._job(context)
-            folder = new_folder(jobs_parent(context, self.output), "reconstruct")
+            folder = folder_for(jobs_parent(context, self.output), asked)
             start(python, folder, asked, scene_name=context.scene.name)
         except (ValueError, jobs.JobError, OSError) as error:
             self.report({"ERROR"}, str(error))
@@ -130,7 +151,7 @@ class FEWVIEW_OT_reconstruct(bpy.types.Operator):
         else:
             images = used_images(settings)
             if len(images) < FEWEST_IMAGES:
-                raise ValueError("There are too few photographs: add at least three in step 1")
+                raise ValueError("There are too few photographs: add at least two in step 1")
         cameras = absolute(self.cameras) if self.cameras else None
         if cameras is None and not self.images:
             cameras = cameras_for(settings, images)
@@ -147,6 +168,7 @@ class FEWVIEW_OT_reconstruct(bpy.types.Operator):
             truth=absolute(self.truth) if self.truth else None,
             region_centre=centre,
             region_radius=radius,
+            keep_stages=False,
         )
 
     def _region(self, context: bpy.types.Context) -> tuple[tuple[float, ...] | None, float | None]:
@@ -164,13 +186,16 @@ def start(python: Path, folder: Path, asked: Job, *, scene_name: str) -> None:
     path = write_job(folder, asked)
     job = PastJob(folder=folder, job=asked)
     uid = scene_named(scene_name).session_uid
+    estimated = True
 
     def on_preview(shown: Path) -> jobs.Steps:
+        nonlocal estimated
         scene_name = scene_name_of(uid)
         if shown.suffix == ".json":
+            estimated = read_solved(shown).estimated
             yield from show_estimated_cameras(shown, job, scene_name)
             return
-        frame = world_from_solved_or_none(scene_named(scene_name), job)
+        frame = world_from_solved_or_none(scene_named(scene_name), job, estimated=estimated)
         if frame is not None:
             wanted = MeshImport(job=str(folder), scene_name=scene_name, world_from_solved=frame)
             yield from show_preview(shown, wanted)
@@ -186,6 +211,7 @@ def start(python: Path, folder: Path, asked: Job, *, scene_name: str) -> None:
         on_finished=on_finished,
         on_preview=on_preview,
         on_end=remove_preview,
+        remedy=IN_PAST_JOBS,
     )
 
 

@@ -10,12 +10,11 @@ from ..camera_objects import JOB
 from ..job_folder import (
     CAMERAS_PAGE,
     REPORT_PAGE,
-    RESULT,
     FolderError,
-    has_fit,
     inside,
     past_jobs,
     read_job,
+    results_in,
 )
 from ..properties import settings_of
 from ..result_mesh import result_or_none
@@ -91,8 +90,7 @@ class _OnFolder:
             return read_job(Path(bpy.path.abspath(self.folder)).absolute()).folder
         result = result_or_none(context)
         if result is not None and result.get(JOB):
-            folder = Path(str(result[JOB]))
-            return folder if has_fit(folder) else read_job(folder).folder
+            return read_job(Path(str(result[JOB]))).folder
         found = past_jobs(jobs_parent(context))
         if not found:
             raise FolderError(RECONSTRUCT_FIRST)
@@ -108,7 +106,7 @@ class FEWVIEW_OT_open_report(_OnFolder, bpy.types.Operator):
     def execute(self, context: bpy.types.Context) -> Status:
         try:
             folder = self._job_folder(context)
-            page = inside(folder, folder / RESULT / REPORT_PAGE)
+            page = inside(folder, results_in(folder) / REPORT_PAGE)
             if not page.is_file():
                 raise FolderError(f"The job {folder.name} has no report")
             bpy.ops.wm.url_open(url=page.as_uri())
@@ -122,7 +120,7 @@ def camera_page_or_none(context: bpy.types.Context) -> Path | None:
     chosen = settings_of(context).cameras_job
     folder = Path(bpy.path.abspath(chosen))
     try:
-        page = inside(folder, folder / RESULT / CAMERAS_PAGE)
+        page = inside(folder, results_in(folder) / CAMERAS_PAGE)
         return page if chosen and page.is_file() else None
     except (FolderError, OSError):
         return None

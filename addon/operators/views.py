@@ -14,7 +14,7 @@ from ..arguments import argument, fill_in
 from ..camera_objects import selected_cameras
 from ..job_folder import new_folder
 from ..properties import FEWVIEW_PG_settings, settings_of
-from ..scenes import in_scene, scene_name_of
+from ..scenes import in_scene, scene_name_of, scene_named
 from ..solved import read_solved
 from ..true_mesh import WITH_SURFACE
 from ..view_cameras import ViewPlan
@@ -96,7 +96,7 @@ class FEWVIEW_OT_remove_views(bpy.types.Operator):
     """Remove the cameras that Generate Cameras made"""
 
     bl_idname = "fewview.remove_views"
-    bl_label = "Remove Cameras"
+    bl_label = "Remove Generated Cameras"
     bl_options = {"REGISTER", "UNDO"}
 
     @classmethod
@@ -190,6 +190,7 @@ class FEWVIEW_OT_render_views(bpy.types.Operator):
             log_path=folder / render_worker.LOG,
             on_finished=lambda _: take_views(scene_uid, folder),
             on_end=partial(render_worker.clean, folder),
+            remedy=f"The views and their cameras are in {folder}.",
             environment=os.environ,
             noisy_start=True,
         )
@@ -202,7 +203,7 @@ def take_views(scene_uid: int, folder: Path) -> Iterator[None]:
     """
     solved = read_solved(folder / TRANSFORMS)
     yield
-    settings: FEWVIEW_PG_settings = bpy.data.scenes[scene_name_of(scene_uid)].fewview
+    settings: FEWVIEW_PG_settings = scene_named(scene_name_of(scene_uid)).fewview
     settings.images.clear()
     add_images(settings, [folder / camera.name for camera in solved.cameras])
     settings.source, settings.camera_source = "RENDER", "KNOWN"

@@ -1,80 +1,68 @@
 """What each part is worth: the stages after the cameras, with one part changed at a time."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
-
-import torch
+from typing import Any, Generic, TypeVar
 
 from ..errors import ReconstructionError
-from ..maths.metrics import TrueSurface, load_truth, surface_error
-from ..presets import PRESETS, Settings
-from ..scene import SurfaceMesh
+from ..machine import choose_device, peak_memory_bytes, set_up_torch
+from ..maths.metrics import load_truth, surface_error
+from ..pipeline import versions
+from ..presets import Settings
+from ..scene import StereoResult, SurfaceMesh
 from ..stages.report import error_numbers
-from ..stages.stereo import StereoResult
-from ..stages.stereo_config import StereoConfig
-from .measuring import Measurement, flat_errors
-from .one_by_one import Placed, extract, fit, match, place, surface_configs
+from ..stages.surface import Surface
+from ..workspace import fingerprint
+from .held_out import held_out_fit, known_views
+from .measuring import Measurement, Numbers, case_files, flat_errors, measuring_fingerprint
+from .one_by_one import Placed, Seconds, extract, fit, match, place, surface_configs
 from .suites import Case
 from .summary import Column
+from .variants import Variant
 
-PRESET = "balanced"
-_NEXT_TO_NOTHING = 1e-6
-"""For weights of the linear fit that replace the prior's: at 0 a node would have none, and no value."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Variant:
-    """The preset with one part changed."""
-
-    name: str
-    setting: str | None = None
-    """Its dotted name in Settings; None where none is changed."""
-    value: object = None
-    with_masks: bool = True
-    """Without them the region stays the one that they gave."""
-
-    def of(self, settings: Settings) -> Settings:
-        """The settings with the change. Raises AttributeError or TypeError where there is no such setting."""
-        if self.setting is None:
-            return settings
-        changed: Settings = _changed(settings, self.setting, self.value)
-        return changed
-
-
-VARIANTS = (
-    Variant(name="as it is"),
-    Variant(name="without growth", setting="stereo.growth_rounds", value=(0, 0, 0)),
-    Variant(name="small pieces kept", setting="stereo.min_piece_px", value=0),
-    Variant(name="without rims", setting="train.linear.rims", value=0.0),
-    Variant(name="without the pull of silhouettes", setting="train.linear.silhouettes", value=0.0),
-    Variant(
-        name="without free space off silhouettes",
-        setting="train.linear.free_space",
-        value=_NEXT_TO_NOTHING,
-    ),
-    Variant(
-        name="without carving by measured depth",
-        setting="train.linear.seen_through",
-        value=_NEXT_TO_NOTHING,
-    ),
-    Variant(name="five rounds of inequalities", setting="train.rounds", value=(5, 5, 5)),
-    Variant(name="with 100 steps of rendering", setting="train.steps", value=(0, 0, 100)),
-    Variant(name="full size alone", setting="stereo.trust_of_half_size", value=0.0),
-    Variant(name="masks ignored", with_masks=False),
-)
+T = TypeVar("T")
 
 COLUMNS = (
     Column(heading="visible Chamfer %", number="visible_chamfer_percent", digits=3),
-    Column(heading="visible F@1%", number="visible_f_score_at_one_percent", digits=3),
-    Column(heading="visible normals", number="visible_normal_consistency", digits=3),
+    Column(heading="F@1%", number="visible_f_score_at_one_percent", digits=3),
+    Column(heading="normals", number="visible_normal_consistency", digits=3),
     Column(heading="whole Chamfer %", number="whole_chamfer_percent", digits=3),
-    Column(heading="stereo s", number="stereo_s", digits=1),
-    Column(heading="field s", number="train_s", digits=1),
-    Column(heading="mesh s", number="mesh_s", digits=1),
+    Column(heading="held out dB", number="held_out_psnr_db", digits=1),
+    Column(heading="stereo s", number="stereo_processor_s", digits=1),
+    Column(heading="field s", number="train_processor_s", digits=1),
+    Column(heading="mesh s", number="mesh_processor_s", digits=1),
+    Column(heading="memory GB", number="peak_memory_bytes", digits=2, scale=1e-9),
 )
+"""Seconds are the processor's, of all threads."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Step(Generic[T]):
+    """A stage's result and its cost."""
+
+    result: T
+    took: Seconds
+    peak_memory_bytes: int | None
+    """Of the process, until then."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Known:
+    """What need not be done again for a variant, because an earlier one had the same settings."""
+
+    stereo: Step[StereoResult] | None = None
+    surface: Step[Surface] | None = None
+
+
+Alone = Callable[..., tuple[Measurement, Known]]
+"""Calls a function with arguments, as `benchmarks.chosen.alone` does in a process of its own."""
+
+
+def at_once(work: Callable[..., tuple[Measurement, Known]], *arguments: Any) -> tuple[Measurement, Known]:
+    """In this process: then the peak of memory is that of all runs so far."""
+    return work(*arguments)
 
 
 def is_random(settings: Settings) -> bool:
@@ -82,46 +70,98 @@ def is_random(settings: Settings) -> bool:
     return any(surface_configs(settings)[1].steps)
 
 
+def inputs_of(case: Case, folder: Path, variant: Variant, device: str, machine: Mapping[str, object]) -> str:
+    """Changes with all that a variant's numbers depend on, but the seed."""
+    parts = (variant, variant.settings, case, device, sorted(machine.items()))
+    return fingerprint(measuring_fingerprint(), Path(__file__), *parts, *case_files(case, folder))
+
+
 def measure_variants(
-    case: Case, folder: Path, variants: Sequence[Variant], *, num_seeds: int, device: torch.device
+    case: Case,
+    folder: Path,
+    variants: Sequence[Variant],
+    *,
+    num_seeds: int,
+    device: str,
+    done: Mapping[tuple[str, int], Measurement],
+    alone: Alone = at_once,
 ) -> Iterator[Measurement]:
     """Each variant on a case, once for each seed where it is random; its name stands for the preset's.
 
-    A stereo result is used again where its settings are the same: then `stereo_s` is None. Raises
-    ReconstructionError where the cameras or the region can not be found; what fails later is told in the
-    measurement.
+    What is `done`, by variant's name and seed, is given back as it is. Stereo and field are used again, with
+    what they cost, where their settings are the same. Raises ReconstructionError where the cameras or the
+    region can not be found; what fails later is told in the measurement.
     """
-    default = PRESETS[PRESET]
-    placed = place(case, folder, case.given, default)
-    truth = None if case.truth is None else load_truth(folder / case.truth)
-    known: dict[tuple[StereoConfig, bool], StereoResult] = {}
+    known: dict[object, Step[Any]] = {}
     for variant in variants:
-        settings = variant.of(default)
-        shown = placed if variant.with_masks else placed.without_masks()
+        settings = variant.settings
+        stereo_config, train = surface_configs(settings)
         for seed in range(num_seeds if is_random(settings) else 1):
-            done = partial(Measurement, case=case.name, preset=variant.name, seed=seed, versions={})
-            stereo_s: float | None = None
-            key = (surface_configs(settings)[0], variant.with_masks)
-            try:
-                if key not in known:
-                    known[key], stereo_s = match(shown, settings, device)
-                surface, train_s = fit(shown, known[key], settings, seed=seed, device=device)
-                mesh, mesh_s = extract(shown, known[key], surface, settings)
-            except ReconstructionError as error:
-                yield done(numbers={}, failure=error.text)
+            if (variant.name, seed) in done:
+                yield done[variant.name, seed]
                 continue
-            numbers = {"stereo_s": stereo_s, "train_s": train_s, "mesh_s": mesh_s}
-            yield done(numbers=numbers if truth is None else numbers | _errors(mesh, truth, shown, seed))
+            of_stereo = (settings.photos, stereo_config, variant.with_masks, variant.cameras_doubted)
+            of_surface = (of_stereo, train, seed)
+            before = Known(stereo=known.get(of_stereo), surface=known.get(of_surface))
+            measurement, after = alone(measure_variant, case, folder, variant, seed, device, before)
+            if after.stereo is not None:
+                known[of_stereo] = after.stereo
+            if after.surface is not None:
+                known[of_surface] = after.surface
+            yield measurement
 
 
-def _errors(mesh: SurfaceMesh, truth: TrueSurface, placed: Placed, seed: int) -> dict[str, float | None]:
+def measure_variant(
+    case: Case, folder: Path, variant: Variant, seed: int, device_kind: str, known: Known
+) -> tuple[Measurement, Known]:
+    """A variant on a case in this process, and what it made."""
+    device = choose_device(device_kind)
+    set_up_torch(device)
+    settings = variant.settings
+    done = partial(
+        Measurement, case=case.name, preset=variant.name, seed=seed, versions=versions(), device=device.type
+    )
+    placed = place(case, folder, case.given, settings)
+    placed = placed if variant.with_masks else placed.without_masks()
+    placed = placed.with_doubted_cameras() if variant.cameras_doubted else placed
+    try:
+        stereo = known.stereo or _step(*match(placed, settings, device))
+        known = replace(known, stereo=stereo)
+        placed = placed.refined(stereo.result)
+        made = known.surface or _step(*fit(placed, stereo.result, settings, seed=seed, device=device))
+        known = replace(known, surface=made)
+        mesh = _step(*extract(placed, stereo.result, made.result, settings))
+    except ReconstructionError as error:
+        return done(numbers={}, failure=error.text), known
+    numbers = {
+        **_costs({"stereo": stereo, "train": made, "mesh": mesh}),
+        **_errors(case, folder, mesh.result, placed, settings, seed),
+    }
+    return done(numbers=numbers), known
+
+
+def _step(result: T, took: Seconds) -> Step[T]:
+    return Step(result=result, took=took, peak_memory_bytes=peak_memory_bytes())
+
+
+def _costs(steps: Mapping[str, Step[Any]]) -> dict[str, float | None]:
+    peaks = [step.peak_memory_bytes for step in steps.values() if step.peak_memory_bytes is not None]
+    costs: dict[str, float | None] = {"peak_memory_bytes": max(peaks) if peaks else None}
+    for name, step in steps.items():
+        costs |= {f"{name}_s": step.took.wall, f"{name}_processor_s": step.took.processor}
+    return costs
+
+
+def _errors(
+    case: Case, folder: Path, mesh: SurfaceMesh, placed: Placed, settings: Settings, seed: int
+) -> Numbers:
     """As a report has them, by the names that a benchmark gives them."""
-    cameras = [view.camera for view in placed.views]
-    num_samples = PRESETS[PRESET].report.error_samples
-    error = surface_error(mesh, truth, cameras=cameras, seed=seed, num_samples=num_samples)
-    return flat_errors(error_numbers(error))
-
-
-def _changed(settings: Any, name: str, value: object) -> Any:
-    first, _, rest = name.partition(".")
-    return replace(settings, **{first: _changed(getattr(settings, first), rest, value) if rest else value})
+    numbers: dict[str, float | None] = {}
+    if case.truth is not None:
+        cameras = [view.camera for view in placed.views]
+        truth, num_samples = load_truth(folder / case.truth), settings.report.error_samples
+        error = surface_error(mesh, truth, cameras=cameras, seed=seed, num_samples=num_samples)
+        numbers |= flat_errors(error_numbers(error))
+    if case.held_out:
+        numbers["held_out_psnr_db"] = held_out_fit(mesh, known_views(case, folder, case.held_out)).psnr_db
+    return numbers

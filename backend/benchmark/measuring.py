@@ -8,7 +8,7 @@ import time
 from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -24,12 +24,14 @@ from ..records import load_record
 from ..results import RADIANCE
 from ..stages.radiance_field import Radiance
 from ..stages.report import error_numbers
+from ..waiting import without_own_policy
 from ..wire.client import ROOT, clean_environment
 from ..workspace import fingerprint
 from .among_surroundings import error_of_subject
 from .held_out import held_out_fit, held_out_radiance_fit, known_views
 from .suites import Case, Found, image_paths, with_budget
 
+_MEASURING = ("among_surroundings.py", "held_out.py", "measuring.py", "one_by_one.py")
 _WITH_KNOWN_CAMERAS = ("region", "stereo", "train", "mesh")
 """The stages after the cameras."""
 _ERRORS = (
@@ -55,13 +57,14 @@ class Trial:
     preset: str
     seed: int
     device: str
+    """Its kind; "auto" is none."""
     budget_s: float | None = None
     """For the field stage; None for what the preset needs."""
 
     @property
     def name(self) -> str:
         """Of its folder."""
-        return f"{self.case.name}-{with_budget(self.preset, self.budget_s)}-{self.seed}"
+        return f"{self.case.name}-{with_budget(self.preset, self.budget_s)}-{self.seed}-{self.device}"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -77,30 +80,41 @@ class Measurement:
     budget_s: float | None = None
     failure: str | None = None
     """What the run, or the comparison with held-out views, said last."""
+    device: str = ""
+    """The kind that it ran on."""
     inputs: str = ""
     """Fingerprint of all that the numbers depend on."""
 
 
 def inputs_of(trial: Trial, machine: Mapping[str, object]) -> str:
     """Changes with the code, the preset's settings, the case's files and the machine."""
-    case, folder = trial.case, trial.folder
-    given = [folder / name for name in (case.images, *case.files)]
-    settings = dataclasses.replace(trial, folder=Path(case.folder)), PRESETS[trial.preset]
-    return fingerprint(code_fingerprint(), settings, sorted(machine.items()), *given)
+    settings = dataclasses.replace(trial, folder=Path(trial.case.folder)), PRESETS[trial.preset]
+    given = case_files(trial.case, trial.folder)
+    return fingerprint(measuring_fingerprint(), settings, sorted(machine.items()), *given)
 
 
-def measured_before(
-    output: Path, found: Found, device: str, machine: Mapping[str, object]
-) -> dict[Trial, Measurement]:
-    """What a benchmark left in the folder, as far as nothing that it depends on has changed since."""
-    try:
-        written = json.loads((output / "results.json").read_text(encoding="utf-8"))["runs"]
-        runs = [Measurement(**run) for run in written]
-    except (OSError, ValueError, KeyError, TypeError):
-        return {}
+def case_files(case: Case, folder: Path) -> tuple[Path, ...]:
+    """Files and folders that a case is read from."""
+    return tuple(folder / name for name in (case.images, *case.files))
+
+
+@cache
+def measuring_fingerprint() -> str:
+    """Changes with the code of runs and with that which measures them."""
+    return fingerprint(code_fingerprint(), *measuring_sources())
+
+
+def measuring_sources() -> tuple[Path, ...]:
+    """The files whose code makes numbers of a run, beside those of the run itself."""
+    here = Path(__file__).parent
+    return (*(here / name for name in _MEASURING), here.parent / "mesh_files.py", here.parent / "records.py")
+
+
+def measured_before(output: Path, found: Found, machine: Mapping[str, object]) -> dict[Trial, Measurement]:
+    """What a benchmark left in the folder, on any device, where nothing that it depends on has changed."""
     places = {case.name: (case, folder) for case, folder in found.cases}
     kept = {}
-    for run in runs:
+    for run in runs_written(output):
         if run.case in places and run.preset in PRESETS and run.failure is None:
             case, folder = places[run.case]
             trial = Trial(
@@ -108,12 +122,21 @@ def measured_before(
                 folder=folder,
                 preset=run.preset,
                 seed=run.seed,
-                device=device,
+                device=run.device,
                 budget_s=run.budget_s,
             )
             if inputs_of(trial, machine) == run.inputs:
                 kept[trial] = run
     return kept
+
+
+def runs_written(output: Path) -> tuple[Measurement, ...]:
+    """All that results.json in a folder holds; nothing where there is none of today's form."""
+    try:
+        written = json.loads((output / "results.json").read_text(encoding="utf-8"))["runs"]
+        return tuple(Measurement(**run) for run in written)
+    except (OSError, ValueError, KeyError, TypeError):
+        return ()
 
 
 def measure(
@@ -128,7 +151,7 @@ def measure(
     started = time.perf_counter()
     exit_code = run_child(
         (*program, *reconstruct_words(trial, output)),
-        environment=clean_environment(os.environ),
+        environment=clean_environment(without_own_policy(os.environ)),
         folder=ROOT,
         request=request,
         on_line=lambda line: last_lines.append(line.strip()) if line.strip() else None,
@@ -140,6 +163,7 @@ def measure(
         preset=trial.preset,
         budget_s=trial.budget_s,
         seed=trial.seed,
+        device=trial.device,
         inputs=inputs,
     )
     if exit_code:
@@ -179,6 +203,7 @@ def report_numbers(report: Mapping[str, Any]) -> dict[str, float | None]:
     numbers["total_s"] = report["total_seconds"]
     numbers["peak_memory_bytes"] = report["peak_memory_bytes"]
     numbers["given_psnr_db"] = report["mean_psnr_db"]
+    numbers["watertight"] = float(report["mesh"]["watertight"])
     return numbers | flat_errors(report["error"] or {})
 
 

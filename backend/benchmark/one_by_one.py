@@ -11,14 +11,15 @@ from typing import TypeVar
 import torch
 
 from ..presets import Settings
-from ..scene import Region, SolvedCameras, SurfaceMesh, View, no_progress
+from ..scene import Region, SolvedCameras, StereoResult, SurfaceMesh, View, no_progress
+from ..stages.camera_refinement import match_solved, with_refined
 from ..stages.cameras import CamerasConfig, solve_cameras
 from ..stages.mesh import extract_mesh
 from ..stages.photos import PhotosConfig, load_photos
 from ..stages.region import find_region
-from ..stages.stereo import StereoResult, match_views
 from ..stages.stereo_config import StereoConfig
-from ..stages.train import ShowSurface, Surface, TrainConfig, fit_surface, show_nothing
+from ..stages.surface import ShowSurface, Surface, show_nothing
+from ..stages.train import TrainConfig, fit_surface
 from .suites import Case, image_paths
 
 T = TypeVar("T")
@@ -28,12 +29,35 @@ T = TypeVar("T")
 class Placed:
     """What stereo starts from."""
 
-    views: tuple[View, ...]
+    solved: SolvedCameras
     region: Region
+
+    @property
+    def views(self) -> tuple[View, ...]:
+        """The photographs with their cameras."""
+        return self.solved.views
 
     def without_masks(self) -> "Placed":
         """The same photographs and the same region, with nothing cut out."""
-        return replace(self, views=tuple(replace(view, mask=None) for view in self.views))
+        bare = tuple(replace(view, mask=None) for view in self.views)
+        return replace(self, solved=replace(self.solved, views=bare))
+
+    def with_doubted_cameras(self) -> "Placed":
+        """The same with cameras that are held against the surface, as if they had been estimated."""
+        return replace(self, solved=replace(self.solved, estimated=True))
+
+    def refined(self, stereo: StereoResult) -> "Placed":
+        """The same with the cameras that the depth maps belong to."""
+        return replace(self, solved=with_refined(self.solved, stereo))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Seconds:
+    """What a stage took."""
+
+    wall: float
+    processor: float
+    """Of all threads: what else a machine does hardly changes it."""
 
 
 def solve(
@@ -51,7 +75,7 @@ def place(case: Case, folder: Path, indices: tuple[int, ...], settings: Settings
     """The case's images with these numbers, undistorted, and the region. Raises ReconstructionError."""
     solved = solve(case, folder, indices, settings.photos, settings.cameras)
     region = find_region(solved, settings.region, progress=no_progress)
-    return Placed(views=solved.views, region=region)
+    return Placed(solved=solved, region=region)
 
 
 def surface_configs(settings: Settings) -> tuple[StereoConfig, TrainConfig]:
@@ -61,10 +85,10 @@ def surface_configs(settings: Settings) -> tuple[StereoConfig, TrainConfig]:
     return settings.stereo, settings.train
 
 
-def match(placed: Placed, settings: Settings, device: torch.device) -> tuple[StereoResult, float]:
+def match(placed: Placed, settings: Settings, device: torch.device) -> tuple[StereoResult, Seconds]:
     """Depth maps and points, and the seconds that they took. Raises ReconstructionError."""
     stereo, _ = surface_configs(settings)
-    work = partial(match_views, placed.views, placed.region, stereo, device=device)
+    work = partial(match_solved, placed.solved, placed.region, stereo, device=device)
     return _timed(partial(work, progress=no_progress))
 
 
@@ -76,7 +100,7 @@ def fit(
     seed: int,
     device: torch.device,
     show: ShowSurface = show_nothing,
-) -> tuple[Surface, float]:
+) -> tuple[Surface, Seconds]:
     """The field, and the seconds that it took. Raises ReconstructionError."""
     _, train = surface_configs(settings)
     work = partial(fit_surface, placed.views, placed.region, stereo, train, show=show)
@@ -86,13 +110,13 @@ def fit(
 
 def extract(
     placed: Placed, stereo: StereoResult, surface: Surface, settings: Settings
-) -> tuple[SurfaceMesh, float]:
+) -> tuple[SurfaceMesh, Seconds]:
     """The mesh, and the seconds that it took. Raises ReconstructionError."""
     work = partial(extract_mesh, placed.views, placed.region, stereo, surface, settings.mesh)
     return _timed(partial(work, progress=no_progress))
 
 
-def _timed(work: Callable[[], T]) -> tuple[T, float]:
-    began_s = time.perf_counter()
+def _timed(work: Callable[[], T]) -> tuple[T, Seconds]:
+    began, processor_began = time.perf_counter(), time.process_time()
     result = work()
-    return result, time.perf_counter() - began_s
+    return result, Seconds(wall=time.perf_counter() - began, processor=time.process_time() - processor_began)

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -33,8 +34,10 @@ def draw(path: Path, summaries: Sequence[Summary]) -> None:
 
     A colour for each case, a marker for each preset. Filled and joined is the Pareto front of a case; hollow
     is what a preset of the same case beats in both. Small and dashed are a preset's runs with a budget,
-    in order of time; they take no part in the front.
+    in order of time; they take no part in the front. On several devices a preset counts as several.
     """
+    if len({summary.device for summary in summaries}) > 1:
+        summaries = [replace(s, preset=f"{s.preset} on {s.device}") for s in summaries]
     with matplotlib.rc_context(_STYLE):
         num_names = len({(summary.case, summary.preset, summary.budget_s is None) for summary in summaries})
         num_columns = max(1, math.ceil(num_names / _ROWS_OF_LEGEND))

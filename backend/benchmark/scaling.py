@@ -10,7 +10,7 @@ from types import MappingProxyType
 
 from ..machine import choose_device, peak_memory_bytes, set_up_torch
 from ..presets import PRESETS, Settings
-from ..stages.train import Surface
+from ..stages.surface import Surface
 from .one_by_one import extract, fit, match, place, surface_configs
 from .suites import Case
 from .summary import Column, markdown
@@ -95,10 +95,10 @@ def measure(case: Case, folder: Path, setup: Setup, device_kind: str) -> Cost:
     def note_time(_surface: Surface) -> None:
         fitted_at_s.append(time.perf_counter())
 
-    stereo, stereo_s = match(placed, settings, device)
-    surface, train_s = fit(placed, stereo, settings, seed=0, device=device, show=note_time)
+    stereo, stereo_took = match(placed, settings, device)
+    surface, train_took = fit(placed, stereo, settings, seed=0, device=device, show=note_time)
     rendering_s = time.perf_counter() - fitted_at_s[-1]
-    _, mesh_s = extract(placed, stereo, surface, settings)
+    _, mesh_took = extract(placed, stereo, surface, settings)
     peak = peak_memory_bytes()
     camera = placed.views[0].camera
     return Cost(
@@ -108,11 +108,11 @@ def measure(case: Case, folder: Path, setup: Setup, device_kind: str) -> Cost:
             "nodes": surface.distance.size,
         },
         numbers={
-            "stereo_s": stereo_s,
-            "train_s": train_s,
+            "stereo_s": stereo_took.wall,
+            "train_s": train_took.wall,
             "finest_grid_s": fitted_at_s[-1] - fitted_at_s[-2],
             "rendering_s": rendering_s if surface_configs(settings)[1].steps[-1] else None,
-            "mesh_s": mesh_s,
+            "mesh_s": mesh_took.wall,
             "peak_memory_bytes": peak,
             "work_memory_bytes": None if peak is None or held is None else peak - held,
         },

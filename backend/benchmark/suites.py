@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
 
-IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png"})
+from ..wire.photographs import photographs_in
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -100,7 +100,7 @@ def with_budget(preset: str, budget_s: float | None) -> str:
 
 
 def _all_images(case: Case, folder: Path) -> list[Path]:
-    return sorted(path for path in (folder / case.images).iterdir() if path.suffix.lower() in IMAGE_SUFFIXES)
+    return sorted(photographs_in(folder / case.images))
 
 
 def _is_complete(case: Case, folder: Path) -> bool:

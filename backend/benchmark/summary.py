@@ -10,11 +10,12 @@ from .suites import with_budget
 
 @dataclass(frozen=True, kw_only=True)
 class Summary:
-    """A case with a preset and a budget, over its seeds; numbers that no run has are missing."""
+    """A case with a preset and a budget on a device, over its seeds; numbers that no run has are missing."""
 
     case: str
     preset: str
     budget_s: float | None
+    device: str
     num_runs: int
     """Those that gave a mesh."""
     failures: tuple[str, ...]
@@ -29,8 +30,10 @@ class Column:
 
     heading: str
     number: str
-    digits: int
+    digits: int = 0
     scale: float = 1.0
+    is_choice: bool = False
+    """Whether 1 is yes and 0 no; yes is said where all runs say so."""
 
 
 COST_COLUMNS = (
@@ -46,7 +49,7 @@ COST_COLUMNS = (
 
 
 def error_columns(part: str) -> tuple[Column, ...]:
-    """The errors of the "visible" or the "whole" surface, and how well support foretells the latter."""
+    """The errors of the "visible" or the "whole" surface, and of the whole what else is asked of it."""
     columns = (
         Column(heading="Chamfer %", number=f"{part}_chamfer_percent", digits=3),
         Column(heading="accuracy %", number=f"{part}_accuracy_percent", digits=3),
@@ -55,15 +58,18 @@ def error_columns(part: str) -> tuple[Column, ...]:
         Column(heading="F@1%", number=f"{part}_f_score_at_one_percent", digits=3),
         Column(heading="normals", number=f"{part}_normal_consistency", digits=3),
     )
-    support = Column(heading="support AUC", number="support_auc", digits=3)
-    return (*columns, support) if part == "whole" else columns
+    of_whole = (
+        Column(heading="support AUC", number="support_auc", digits=3),
+        Column(heading="closed", number="watertight", is_choice=True),
+    )
+    return (*columns, *of_whole) if part == "whole" else columns
 
 
 def aggregate(runs: Sequence[Measurement]) -> tuple[Summary, ...]:
-    """One summary for each case, preset and budget, in the order in which they first appear."""
-    groups: dict[tuple[str, str, float | None], list[Measurement]] = {}
+    """One summary for each case, preset, budget and device, in the order in which they first appear."""
+    groups: dict[tuple[str, str, float | None, str], list[Measurement]] = {}
     for run in runs:
-        groups.setdefault((run.case, run.preset, run.budget_s), []).append(run)
+        groups.setdefault((run.case, run.preset, run.budget_s, run.device), []).append(run)
     return tuple(_summary(group) for group in groups.values())
 
 
@@ -78,6 +84,7 @@ def _summary(runs: Sequence[Measurement]) -> Summary:
         case=runs[0].case,
         preset=runs[0].preset,
         budget_s=runs[0].budget_s,
+        device=runs[0].device,
         num_runs=sum(bool(run.numbers) for run in runs),
         failures=tuple(run.failure for run in runs if run.failure is not None),
         median={name: statistics.median(values) for name, values in known.items()},
@@ -104,13 +111,15 @@ def _dominates(one: tuple[float, float], other: tuple[float, float]) -> bool:
 def table(summaries: Sequence[Summary], columns: Sequence[Column], *, compared: str = "preset") -> str:
     """A Markdown table with a row for each summary: the median, and after ± half the range over the seeds.
 
-    `compared` is the heading of what runs of a case differ in.
+    `compared` is the heading of what runs of a case differ in; several devices have a column of their own.
     """
-    headings = ["case", compared, *(column.heading for column in columns)]
+    several = len({summary.device for summary in summaries}) > 1
+    headings = ["case", compared, *(["device"] * several), *(column.heading for column in columns)]
     rows = [
         [
             summary.case,
             with_budget(summary.preset, summary.budget_s),
+            *([summary.device] * several),
             *(_cell(summary, column) for column in columns),
         ]
         for summary in summaries
@@ -134,6 +143,8 @@ def _cell(summary: Summary, column: Column) -> str:
     if median is None:
         return "-"
     lowest, highest = summary.lowest[column.number], summary.highest[column.number]
+    if column.is_choice:
+        return "yes" if lowest == 1 else "no"
     text = f"{median * column.scale:.{column.digits}f}"
     if summary.num_runs == 1:
         return text

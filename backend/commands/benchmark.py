@@ -4,6 +4,7 @@ import argparse
 import math
 import sys
 from collections.abc import Sequence
+from datetime import UTC, datetime
 from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -44,6 +45,12 @@ def add_benchmark(parser: argparse.ArgumentParser) -> None:
     )
     add("--only-budgets", action="store_true", help="leave out the runs without a budget")
     add("--device", choices=DEVICES, default="auto", help="where to compute (auto)")
+    add(
+        "--record",
+        metavar="DIR",
+        type=Path,
+        help="where to leave SUITE.json and SUITE.md, to be kept with the code",
+    )
 
 
 def benchmark(parsed: argparse.Namespace, *, program: Sequence[str] | None = None) -> int:
@@ -64,11 +71,14 @@ def benchmark(parsed: argparse.Namespace, *, program: Sequence[str] | None = Non
 
 def _measure_all(parsed: argparse.Namespace, program: tuple[str, ...], request: CancelRequest) -> None:
     # Here, so that the other commands start without torch; and before hours of work, if one is missing.
-    from ..benchmark.measuring import Trial, inputs_of, measure, measured_before
+    from ..benchmark.measuring import Trial, inputs_of, measure, measured_before, measuring_fingerprint
+    from ..benchmark.record import write_record
     from ..benchmark.writing import machine_facts, write_results
+    from ..machine import choose_device
 
     found = find_cases(SUITES[parsed.suite], parsed.scenes, parsed.photos)
     _check(parsed, found)
+    device = choose_device(parsed.device).type
     budgets_s = parsed.budgets if parsed.only_budgets else [None, *parsed.budgets]
     machine = machine_facts()
     about = {
@@ -76,22 +86,25 @@ def _measure_all(parsed: argparse.Namespace, program: tuple[str, ...], request: 
         "presets": parsed.presets,
         "budgets_s": parsed.budgets,
         "seeds": list(range(parsed.seeds)),
-        "device": parsed.device,
+        "device": device,
         "machine": machine,
         "missing": found.missing,
     }
     if found.missing:
         _say(f"Left out, because their files are not there: {', '.join(found.missing)}")
     trials = [
-        Trial(case=case, folder=folder, preset=preset, seed=seed, device=parsed.device, budget_s=budget_s)
+        Trial(case=case, folder=folder, preset=preset, seed=seed, device=device, budget_s=budget_s)
         for case, folder in found.cases
         for preset, budget_s, seed in product(parsed.presets, budgets_s, range(parsed.seeds))
     ]
-    runs = measured_before(parsed.output, found, parsed.device, machine)
+    runs = measured_before(parsed.output, found, machine)
+
+    def measured() -> list["Measurement"]:
+        asked_first = dict.fromkeys((*trials, *runs))
+        return [runs[trial] for trial in asked_first if trial in runs]
 
     def write() -> None:
-        asked_first = dict.fromkeys((*trials, *runs))
-        write_results(parsed.output, about, [runs[trial] for trial in asked_first if trial in runs])
+        write_results(parsed.output, about, measured())
 
     if runs:
         _say(f"Kept from before, as nothing that it depends on has changed: {len(runs)}.")
@@ -107,6 +120,9 @@ def _measure_all(parsed: argparse.Namespace, program: tuple[str, ...], request: 
             )
             _say(_line(runs[trial]))
             write()
+    if parsed.record is not None:
+        today = datetime.now(UTC).date().isoformat()
+        write_record(parsed.record, about, measured(), code=measuring_fingerprint(), date=today)
     sys.stdout.write(f"{parsed.output / 'table.md'}\n")
 
 

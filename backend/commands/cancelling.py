@@ -52,7 +52,8 @@ def watch_signals(request: CancelRequest, on_first: Callable[[], None]) -> None:
     a long call of a library returns, which is just when the user loses patience.
     """
     reader, writer = os.pipe()
-    os.set_blocking(writer, False)
+    if sys.platform != "win32":  # there pipes know it since Python 3.12 alone, and nobody asks for it
+        os.set_blocking(writer, False)
     signal.set_wakeup_fd(writer, warn_on_full_buffer=False)
     catch_signals()
 

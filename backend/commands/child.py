@@ -91,7 +91,8 @@ if sys.platform == "win32":
     def _end_group(process: subprocess.Popen[str]) -> None:
         if process.poll() is None:
             command = ["taskkill", "/T", "/F", "/PID", str(process.pid)]
-            subprocess.run(command, check=False, capture_output=True)
+            # Not this program's stdin: a program that is given a pipe on which a thread waits may wait too.
+            subprocess.run(command, check=False, capture_output=True, stdin=subprocess.DEVNULL)
             process.wait()
 
 else:

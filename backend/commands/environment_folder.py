@@ -6,19 +6,15 @@ Only folders with the installer's marker in them are ever changed. Standard libr
 import json
 import os
 import shutil
-import sys
-import time
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 
 from ..errors import ErrorCode, ReconstructionError
-from ..failures import is_disk_full
+from ..failures import output_unusable
 from ..file_lock import lock
+from ..held_files import when_let_go
 from ..wire.environment import LOCK, MARKER, OLD, PART, beside, is_ours, needed_bytes
-
-_RENAME_TRIES_S = (0.2, 0.5, 1.0, 2.0)
-"""Waits between tries: on Windows a virus scanner holds new files for a moment."""
 
 
 @contextmanager
@@ -168,12 +164,7 @@ def _removed_or_warning(folder: Path) -> str:
 def _rename(source: Path, target: Path) -> None:
     if _is_empty_folder(target):
         target.rmdir()  # Windows renames onto nothing that exists
-    for wait_s in _RENAME_TRIES_S if sys.platform == "win32" else ():
-        with suppress(PermissionError):
-            source.rename(target)
-            return
-        time.sleep(wait_s)
-    source.rename(target)
+    when_let_go(lambda: source.rename(target))
 
 
 def _is_empty_folder(folder: Path) -> bool:
@@ -186,11 +177,8 @@ def _size_bytes(folder: Path) -> int:
 
 
 def _not_writable(folder: Path, error: OSError) -> Exception:
-    """What to raise for an error of the file system; a full disk stays what it is."""
-    if is_disk_full(error):
-        return error
-    return ReconstructionError(
-        ErrorCode.OUTPUT_UNUSABLE,
+    return output_unusable(
+        error,
         f"{folder} cannot be written ({error.strerror or error}).",
         "Choose a folder that you may write to, and close programs that use it.",
     )

@@ -7,8 +7,9 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ..errors import ErrorCode, ReconstructionError
+from ..point_methods import PointMethod
 from ..wire import protocol
+from .argument_types import seed
 from .cancelling import catch_signals
 from .reconstruct import converse_or_show
 
@@ -17,9 +18,6 @@ if TYPE_CHECKING:
     from ..pipeline import Listener, Outcome
     from ..scene import SurfaceMesh
     from ..workspace import Workspace
-
-POINT_METHODS = ("linear", "neural-pull", "nap", "sdro", "entropy")
-"""As `stages.point_fit` and `stages.point_network` name them; here, so that --help needs no torch."""
 
 _STAGES = ("points", "surface", "mesh")
 
@@ -36,10 +34,11 @@ def add_fit_points(parser: argparse.ArgumentParser) -> None:
         help="new or empty folder, or of an earlier fit",
     )
     add("--normals-known", action="store_true", help="the file's normals point outwards: meet them")
-    add("--method", choices=POINT_METHODS, default="linear", help="how the field is found (linear)")
+    methods = [method.value for method in PointMethod]
+    add("--method", choices=methods, default=methods[0], help=f"how the field is found ({methods[0]})")
     add("--truth", metavar="MESH", type=Path, help="true mesh to measure the result against")
     add("--device", choices=protocol.DEVICES, default="auto", help="where to compute (auto)")
-    add("--seed", type=int, metavar="N", default=0, help="of all chance (0)")
+    add("--seed", type=seed, metavar="N", default=0, help="random seed (0)")
     add("--wire", action="store_true", help="for programs: messages on stdout")
 
 
@@ -62,12 +61,7 @@ def _fit(parsed: argparse.Namespace, listener: "Listener") -> "Outcome":
     truth = None if parsed.truth is None else load_truth(parsed.truth)
     with open_workspace(parsed.output) as workspace:
         try:
-            if any(workspace.private.glob("*.npz")):
-                raise ReconstructionError(
-                    ErrorCode.OUTPUT_UNUSABLE,
-                    f"{parsed.output} holds a reconstruction from photographs.",
-                    "Choose a new or empty folder for --output.",
-                )
+            workspace.claim("points")
             return _fit_into(workspace, parsed, listener, truth)
         finally:
             workspace.discard_if_nothing_done()
@@ -96,7 +90,7 @@ def _fit_into(
     for decision in cloud.decisions:
         listener.warned(f"{decision.what}: {decision.choice}")
     stages.next()
-    config = PointFitConfig(method=parsed.method, normals_known=parsed.normals_known)
+    config = PointFitConfig(method=PointMethod(parsed.method), normals_known=parsed.normals_known)
     generator = torch.Generator().manual_seed(parsed.seed)
     surface = fit_points(cloud, config, device=device, generator=generator, progress=listener.progressed)
     stages.next()

@@ -119,13 +119,16 @@ def run_job(job: protocol.Job, base: Path, listener: "Listener") -> "Outcome":
     with open_workspace(resolved.output) as workspace:
         try:
             with _logging_to(workspace.log_path):
-                return pipeline.run(
+                outcome = pipeline.run(
                     resolved,
                     workspace,
                     settings=settings_of(job),
                     stages=pipeline.STAGES,
                     listener=listener,
                 )
+            if not job.keep_stages:
+                workspace.discard_stages()
+            return outcome
         except (ReconstructionError, Cancelled):
             workspace.discard_if_nothing_done()
             raise
@@ -184,7 +187,7 @@ def cancelled_message() -> protocol.Failed:
     return protocol.Failed(
         code=protocol.CANCELLED,
         text="The reconstruction was stopped; finished stages are kept.",
-        remedy="Start the same job again to resume.",
+        remedy="Start the same again, and it goes on from there.",
     )
 
 

@@ -44,10 +44,11 @@ def write_mesh(path: Path, *, size: float = 1.0) -> None:
 
 
 def write_sparse(path: Path) -> None:
-    """Write the corners as sparse.ply."""
+    """Write the corners as sparse.ply; all cameras see them."""
     points = zip(_CORNERS, _COLOURS, strict=True)
-    body = b"".join(struct.pack("<3d3B", *corner, *colour) for corner, colour in points)
-    path.write_bytes(_header((*_POSITION, *_COLOUR)) + body)
+    all_cameras = 2 ** len(_AZIMUTHS_DEG) - 1
+    body = b"".join(struct.pack("<3d4B", *corner, *colour, all_cameras) for corner, colour in points)
+    path.write_bytes(_header((*_POSITION, *_COLOUR, "property uchar seen_0")) + body)
 
 
 def write_cameras(path: Path) -> None:

@@ -30,12 +30,10 @@ def make_environment(folder: Path, installer: Installer) -> None:
         if installer.run(command) and works(folder, installer):
             installer.progress(1.0, "")
             return
-    python = "py -3.12" if sys.platform == "win32" else "python3.12"
     raise ReconstructionError(
         ErrorCode.MISSING_DEPENDENCY,
         "There is no Python from 3.11 on with the modules venv and ensurepip on this computer.",
-        "Install uv or Python 3.12 and try again, or make an environment by hand: "
-        f"`{python} -m venv ENVIRONMENT`, then install the packages with Copy Install Lines.",
+        "Install uv or Python 3.12 and try again, or make an environment as Set Up by Hand says.",
     )
 
 

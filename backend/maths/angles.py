@@ -19,3 +19,11 @@ def angles_between(
 def widest_angle_deg(directions: Float64[np.ndarray, "rays 3"]) -> float:
     """The widest angle between any two unit directions."""
     return float(np.degrees(angles_between(directions[:, None], directions[None]).max()))
+
+
+def triangulation_angle_deg(
+    position: Float64[np.ndarray, "3"], centres: Float64[np.ndarray, "cameras 3"]
+) -> float:
+    """The widest angle at a point between the rays to the cameras' centres."""
+    rays = centres - position
+    return widest_angle_deg(rays / np.linalg.norm(rays, axis=1, keepdims=True))

@@ -35,6 +35,8 @@ def point_distances(
     normals: Float[Tensor, "points 3"],
     confidence: Float[Tensor, "points"],
     nodes: int,
+    *,
+    spread_cells: float = 1.0,
 ) -> PointDistances:
     """Weighted mean of n . (q - p) over the points within two cells of each node q."""
     h = spacing(nodes)
@@ -52,8 +54,8 @@ def point_distances(
         f = place - base
         along = normal @ steps.T - (f * normal).sum(dim=-1, keepdim=True)
         apart2 = steps.square().sum(dim=-1) - 2 * f @ steps.T + f.square().sum(dim=-1, keepdim=True)
-        # a Gaussian that is one cell wide across the normal, two along it
-        weight = sure[:, None] * torch.exp(0.75 * along * along - apart2)
+        # a Gaussian that is twice as wide along the normal as across it
+        weight = sure[:, None] * torch.exp((0.75 * along * along - apart2) / spread_cells**2)
         at = ((base.long() + _BEYOND) @ strides)[:, None] + offset_at
         terms = torch.stack([weight * along, weight], dim=-1)
         sums.index_add_(0, at.flatten(), terms.flatten(0, 1))
@@ -75,8 +77,10 @@ def merged_points(
 
     The same way is the same side of a die, so that the two faces of a thin sheet stay apart. If the errors
     of neighbours are `correlated`, more points are not more evidence: the confidence is the mean, in which
-    each counts by itself.
+    each counts by itself. Of no points there are none.
     """
+    if not len(positions):
+        return positions, normals, confidence
     place = (positions / cell).floor().long()
     place -= place.amin(dim=0)
     axis = normals.abs().argmax(dim=-1)

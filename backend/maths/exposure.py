@@ -1,9 +1,11 @@
 """How much brighter one photograph is than another, from surface that both show."""
 
-from itertools import combinations
-
 import numpy as np
 from jaxtyping import Bool, Float64
+from scipy.sparse.csgraph import minimum_spanning_tree
+
+_NEAREST = 3
+"""Photographs that each one is compared with, beside those that join all that can be joined."""
 
 
 def log_exposures(
@@ -12,8 +14,8 @@ def log_exposures(
     """Natural logarithm of each photograph's exposure: log light is log exposure and log colour together.
 
     Two photographs differ by the median over what both show: a highlight in one of them, or surface that is
-    not where it is thought to be, is a minority. All pairs together are solved by least squares, each
-    weighing as much as it shows in common. Photographs that nothing joins have a mean of 0 each for
+    not where it is thought to be, is a minority. All `compared_pairs` together are solved by least squares,
+    each weighing as much as it shows in common. Photographs that nothing joins have a mean of 0 each for
     themselves: what is common to all is no exposure but the brightness of the subject.
     """
     differences = _differences(log_light, shown)
@@ -30,14 +32,31 @@ def log_exposures(
 def disagreement(
     log_light: Float64[np.ndarray, "views points"], shown: Bool[np.ndarray, "views points"]
 ) -> float:
-    """Median difference between two photographs, over all that any two show; 0 if there is nothing."""
+    """Median difference between two photographs over all `compared_pairs`; 0 where there are none."""
     apart = [np.abs(values) for _, _, values in _differences(log_light, shown)]
     return float(np.median(np.concatenate(apart))) if apart else 0.0
+
+
+def compared_pairs(shown: Bool[np.ndarray, "views points"]) -> list[tuple[int, int]]:
+    """Each photograph with the few that share most of what it shows; their number grows with the photographs.
+
+    The tree of the pairs that share most is among them, so that whatever all pairs would join is joined.
+    """
+    seen = shown.astype(np.float32)
+    shared = seen @ seen.T
+    np.fill_diagonal(shared, 0)
+    most = np.argsort(-shared, axis=1, kind="stable")[:, :_NEAREST]
+    chosen = np.zeros(shared.shape, bool)
+    np.put_along_axis(chosen, most, True, axis=1)
+    # of weights below 0 the least tree is the greatest; where nothing is shared there is no edge
+    chosen |= minimum_spanning_tree(-shared).toarray() != 0
+    one, other = np.nonzero(np.triu((chosen | chosen.T) & (shared > 0)))
+    return list(zip(one.tolist(), other.tolist(), strict=True))
 
 
 def _differences(
     log_light: Float64[np.ndarray, "views points"], shown: Bool[np.ndarray, "views points"]
 ) -> list[tuple[int, int, Float64[np.ndarray, "shared"]]]:
-    """For each two photographs that show something in common, by how much they differ there."""
-    pairs = ((i, j, shown[i] & shown[j]) for i, j in combinations(range(len(log_light)), 2))
-    return [(i, j, log_light[i, both] - log_light[j, both]) for i, j, both in pairs if both.any()]
+    """For each two photographs that are compared, by how much they differ in what both show."""
+    both = [(i, j, shown[i] & shown[j]) for i, j in compared_pairs(shown)]
+    return [(i, j, log_light[i, common] - log_light[j, common]) for i, j, common in both]

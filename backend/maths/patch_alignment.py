@@ -14,6 +14,7 @@ from jaxtyping import Float, Float64
 from torch import Tensor
 
 from ..scene import Camera
+from .gauge import cross_matrix
 from .geometry import Pinhole, ray_directions, sample_image
 
 _LEAST_SPREAD = 1e-6
@@ -128,9 +129,7 @@ def _solved(
 def fundamental_matrix(a: Camera, b: Camera) -> Float64[np.ndarray, "3 3"]:
     """F of pixel_b^T F pixel_a = 0 for all points in space."""
     b_from_a = b.camera_from_world @ np.linalg.inv(a.camera_from_world)
-    x, y, z = b_from_a[:3, 3]
-    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    essential = cross @ b_from_a[:3, :3]
+    essential = cross_matrix(b_from_a[:3, 3]) @ b_from_a[:3, :3]
     fundamental: Float64[np.ndarray, "3 3"]
     fundamental = np.linalg.inv(b.intrinsics).T @ essential @ np.linalg.inv(a.intrinsics)
     return fundamental

@@ -131,16 +131,6 @@ def _dot(a: Float[np.ndarray, "rays 3"], b: Float[np.ndarray, "rays 3"]) -> Floa
     return np.asarray(np.einsum("rd,rd->r", a, b), np.float64)  # three times as fast as (a * b).sum(-1)
 
 
-def cast_rays(
-    vertices: Float[np.ndarray, "vertices 3"],
-    faces: Int[np.ndarray, "faces 3"],
-    origins: Float[np.ndarray, "rays 3"],
-    directions: Float[np.ndarray, "rays 3"],
-) -> RayHits:
-    """First hits of one batch; for several batches on one mesh keep a RayCaster."""
-    return RayCaster(vertices, faces).cast(origins, directions)
-
-
 def camera_rays(
     camera: Camera, rows: slice = EVERYTHING, columns: slice = EVERYTHING
 ) -> tuple[Float64[np.ndarray, "pixels 3"], Float64[np.ndarray, "pixels 3"]]:

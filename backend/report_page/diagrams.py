@@ -12,7 +12,7 @@ from PIL import Image
 
 from ..images import resized
 from ..scene import Region, View
-from .pictures import up_direction
+from .pictures import up_of
 
 _THUMBNAIL_PX = 96
 _GRAPH_WIDTH, _GRAPH_HEIGHT = 720, 640
@@ -171,7 +171,7 @@ def top_view(
 
 def _map_axes(views: Sequence[View], region: Region) -> Float64[np.ndarray, "2 3"]:
     """Right and up on the page: seen from above, with the cameras' mean place below the subject."""
-    up = up_direction([view.camera for view in views])
+    up = up_of([view.camera for view in views])
     towards = np.mean([view.camera.position for view in views], axis=0) - region.centre_world
     level = towards - towards @ up * up
     if np.linalg.norm(level) < 1e-6 * region.radius_world:  # cameras all around

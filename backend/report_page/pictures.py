@@ -16,6 +16,7 @@ from PIL import Image
 from ..images import resized
 from ..maths.raycast import MeshImage
 from ..maths.srgb import srgb_from_linear
+from ..maths.upright import up_direction
 from ..scene import Camera
 
 JPEG_QUALITY = 86
@@ -35,9 +36,6 @@ ERROR_STOPS_SRGB = np.array([[245, 241, 232], [252, 196, 110], [226, 88, 52], [1
 
 TURNTABLE_FIELD_OF_VIEW_DEG = 30.0
 TURNTABLE_ELEVATION_DEG = 18.0
-
-LEVELNESS_WEIGHT = 0.01
-"""Of the pictures' own up beside the x axes, which spread by 0.01 within an arc of about 20 degrees."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -114,7 +112,7 @@ def turntable_cameras(
     low, high = np.quantile(vertices, [0.01, 0.99], axis=0)
     centre = (low + high) / 2
     radius = float(np.quantile(np.linalg.norm(vertices - centre, axis=1), 0.99)) or 1.0
-    up = up_direction(cameras)
+    up = up_of(cameras)
     towards = np.mean([_direction(camera.position - centre) for camera in cameras], axis=0)
     front = _level_direction(towards, up)
     side = np.cross(up, front)
@@ -129,17 +127,10 @@ def turntable_cameras(
     return tuple(found)
 
 
-def up_direction(cameras: Sequence[Camera]) -> Float64[np.ndarray, "3"]:
-    """Unit vector of the world that is up, for photographs held upright with a level horizon.
-
-    A level camera's x axis is horizontal however much the camera is tilted: up is the direction most
-    across all x axes. Where they are parallel, the mean of the pictures' own up decides.
-    """
-    x_axes, tops = (np.stack([camera.camera_from_world[row, :3] for camera in cameras]) for row in (0, 1))
-    top = _direction(-tops.mean(axis=0))
-    along = x_axes.T @ x_axes / len(x_axes) - LEVELNESS_WEIGHT * np.outer(top, top)
-    up = np.asarray(np.linalg.eigh(along)[1][:, 0])
-    return up if up @ top >= 0 else -up
+def up_of(cameras: Sequence[Camera]) -> Float64[np.ndarray, "3"]:
+    """Unit vector of the world that is up, for photographs held upright, as Blender has it."""
+    rights, bottoms, forwards = np.stack([camera.camera_from_world[:3, :3] for camera in cameras], axis=1)
+    return up_direction(rights, -bottoms, -forwards)
 
 
 def _looking_at(

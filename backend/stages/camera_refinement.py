@@ -21,10 +21,20 @@ from torch import Tensor
 from ..maths.geometry import Pinhole, inside, pinhole_in_object, project, sample_image
 from ..maths.patch_alignment import align, beside_epipolar_lines_px, on_planes, patch_pixels
 from ..maths.projection import projected
-from ..scene import Camera, Decision, Progress, Region, SolvedCameras, SurfacePoints, View, transform_points
+from ..scene import (
+    Camera,
+    Decision,
+    Progress,
+    Region,
+    SolvedCameras,
+    StereoResult,
+    SurfacePoints,
+    View,
+    transform_points,
+)
 from .bundle_adjustment import adjust_bundle
 from .lenses import rigid_matrix
-from .stereo import StereoResult, match_views, unmatched
+from .stereo import match_views, unmatched
 from .stereo_config import StereoConfig
 from .stereo_windows import neighbours
 
@@ -207,7 +217,8 @@ def find_patches(
 
 
 def _float64(parts: list[Tensor]) -> Float64[np.ndarray, "rows columns"]:
-    joined: Float64[np.ndarray, "rows columns"] = torch.cat(parts).double().cpu().numpy()
+    # In this order: Apple's GPUs know no float64.
+    joined: Float64[np.ndarray, "rows columns"] = torch.cat(parts).cpu().double().numpy()
     return joined
 
 

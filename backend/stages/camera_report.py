@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64
 
-from ..maths.angles import widest_angle_deg
+from ..maths.angles import triangulation_angle_deg
 from ..maths.sampling import mean_colours
 from ..report_page.diagrams import Bar, histogram, match_graph, thumbnail, top_view
 from ..report_page.template import filled
@@ -118,11 +118,9 @@ def build_camera_report(
 def point_angles_deg(solved: SolvedCameras) -> Float64[np.ndarray, "points"]:
     """For each sparse point, the widest angle between the rays to the cameras that see it."""
     centres = np.array([view.camera.position for view in solved.views])
-    angles = []
-    for position, seen in zip(solved.sparse_positions, solved.sparse_visibility, strict=True):
-        rays = centres[seen] - position
-        angles.append(widest_angle_deg(rays / np.linalg.norm(rays, axis=1, keepdims=True)))
-    return np.array(angles, np.float64)
+    points = zip(solved.sparse_positions, solved.sparse_visibility, strict=True)
+    angles = (triangulation_angle_deg(position, centres[seen]) for position, seen in points)
+    return np.fromiter(angles, np.float64)
 
 
 def _photos(solved: SolvedCameras, diameter: float) -> tuple[PhotoFacts, ...]:

@@ -33,7 +33,8 @@ def solve_cameras(
 ) -> SolvedCameras:
     """Cameras read from `given` or, without it, found from the photographs, and the undistorted views.
 
-    `given` is a nerfstudio transforms.json, a COLMAP model, or a folder with one of them.
+    `given` is a nerfstudio transforms.json, a COLMAP model, or a folder with one of them. Cameras that
+    FewView's own cameras.json says were estimated are so again, with the points of the sparse.ply beside it.
     Files are written to workdir alone. The same seed gives the same cameras to the bit.
     Raises ReconstructionError: CAMERAS_UNUSABLE, NO_OVERLAP, NO_PARALLAX, TOO_FEW_PLACED.
     """
@@ -63,7 +64,7 @@ def solve_cameras(
         views=tuple(views),
         lenses=tuple(photo_lens(photos[placed.index], placed) for placed in placement.placed),
         unplaced=placement.unplaced,
-        estimated=given is None,
+        estimated=placement.estimated,
         sparse_positions=positions,
         sparse_visibility=visibility,
         reprojection_error_px=placement.reprojection_error_px,

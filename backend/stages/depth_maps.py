@@ -169,7 +169,7 @@ def _moved(
 
 
 def _sweep(window: Window, sources: list[Window], config: StereoConfig) -> Map:
-    """Best plane of every pixel after semi-global matching, to a fraction of a step."""
+    """Best plane of every pixel, after semi-global matching where asked for, to a fraction of a step."""
     if not sources:
         nothing = torch.zeros_like(window.grey)
         return Map(window=window, inverse_depth=nothing, score=nothing)
@@ -183,11 +183,13 @@ def _sweep(window: Window, sources: list[Window], config: StereoConfig) -> Map:
         for chunk in planes.tensor_split(math.ceil(count / 16))
     ]
     score = torch.cat(chunks)
-    gradient = window.grey.diff(dim=0, append=window.grey[-1:]).abs()
-    gradient += window.grey.diff(dim=1, append=window.grey[:, -1:]).abs()
-    large_step = 0.3 + 0.7 * torch.exp(-gradient / 0.04)
     cost = (1 - score).permute(1, 2, 0).contiguous()
-    index, offset = lowest_with_neighbours(aggregate(cost, 0.08, large_step))
+    if config.semi_global:
+        gradient = window.grey.diff(dim=0, append=window.grey[-1:]).abs()
+        gradient += window.grey.diff(dim=1, append=window.grey[:, -1:]).abs()
+        large_step = 0.3 + 0.7 * torch.exp(-gradient / 0.04)
+        cost = aggregate(cost, 0.08, large_step)
+    index, offset = lowest_with_neighbours(cost)
     inverse_depth = planes[index] + offset * (planes[1] - planes[0])
     best = score.permute(1, 2, 0).gather(-1, index[..., None])[..., 0]
     return Map(window=window, inverse_depth=inverse_depth, score=best)

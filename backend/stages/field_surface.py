@@ -7,7 +7,7 @@ from torch import Tensor
 from ..maths.grid import node_positions
 from ..maths.rays import DistanceFunction
 from ..scene import Region
-from .train import COARSEST, Surface, tight_frame
+from .surface import COARSEST, Surface, tight_frame
 
 _AT_ONCE = 2**16
 """Points in one call of the function: memory for more would not make it quicker."""

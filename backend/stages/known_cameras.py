@@ -1,19 +1,22 @@
 """Cameras that are given: nerfstudio's transforms.json, or a COLMAP model, matched to the photographs."""
 
 import typing
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path, PurePosixPath
+from types import MappingProxyType
 
 import numpy as np
 import PIL.Image  # noqa: F401 - pycolmap loaded before Pillow corrupts memory when Pillow next saves
 import pycolmap
-from jaxtyping import Float64
+from jaxtyping import Bool, Float64
 
 from ..errors import ErrorCode, ReconstructionError
 from ..images import same_shape
-from ..scene import Camera, Photo, Unplaced
+from ..mesh_files import SPARSE, MeshFileError, read_sparse
+from ..scene import Camera, Decision, Photo, Unplaced
+from ..wire.photographs import is_named
 from .lenses import PlacedPhoto, Placement, rigid_matrix, sparse_points, undistorted_view
-from .nerfstudio import camera_from_world, frame_lens, read_frames
+from .nerfstudio import Estimate, camera_from_world, estimate_or_none, frame_lens, read_frames
 
 _ROTATION_TOLERANCE = 5e-3
 """Poses are often written with few digits; nearer than this they are made exact."""
@@ -21,6 +24,7 @@ _ROTATION_TOLERANCE = 5e-3
 LARGEST_SIDE_PX = 20_000
 """Of a picture to render: 400 million pixels are a slip of the pen."""
 
+_NOTHING: Mapping[int, str] = MappingProxyType({})
 _CHECK = "Check that the cameras belong to these photographs."
 
 
@@ -139,19 +143,51 @@ def _find_source(given: Path) -> Path:
 
 def _from_transforms(photos: Sequence[Photo], path: Path) -> Placement:
     frames = read_frames(path)
-    matched = _matched(photos, [str(frame["file_path"]) for frame in frames], path)
+    estimate = estimate_or_none(path)
+    why = _why_unplaced(photos, estimate)
+    matched = _matched(photos, [str(frame["file_path"]) for frame in frames], path, left_out=why)
     placed = []
     for index, number in sorted(matched.items()):
         photo, frame = photos[index], frames[number]
         lens = frame_lens(frame, photo)
         placed.append(_placed(index, photo, lens, camera_from_world(frame, photo.name)))
+    columns = [number for _, number in sorted(matched.items())]
+    positions, visibility = np.zeros((0, 3)), np.zeros((0, len(placed)), bool)
+    if estimate is not None:
+        positions, visibility = _points_beside(path, columns, len(frames))
+    because = f"{path.name} says that FewView estimated them"
     return Placement(
         placed=tuple(placed),
-        unplaced=_unplaced(photos, matched, path),
-        sparse_positions=np.zeros((0, 3)),
-        sparse_visibility=np.zeros((0, len(placed)), bool),
-        reprojection_error_px=None,
+        unplaced=_unplaced(photos, matched, path, why),
+        sparse_positions=positions,
+        sparse_visibility=visibility,
+        reprojection_error_px=None if estimate is None else estimate.reprojection_error_px,
+        estimated=estimate is not None,
+        decisions=()
+        if estimate is None
+        else (Decision(what="cameras", choice="as found before", because=because),),
     )
+
+
+def _why_unplaced(photos: Sequence[Photo], estimate: Estimate | None) -> dict[int, str]:
+    """Why an earlier job could not place some of the photographs."""
+    told = {} if estimate is None else estimate.why_unplaced
+    return {
+        i: why for i, photo in enumerate(photos) for name, why in told.items() if is_named(photo.path, name)
+    }
+
+
+def _points_beside(
+    path: Path, columns: Sequence[int], num_cameras: int
+) -> tuple[Float64[np.ndarray, "points 3"], Bool[np.ndarray, "points columns"]]:
+    """The points that two of these cameras see, of the sparse.ply beside the file; none where it has none."""
+    try:
+        positions, visibility = read_sparse(path.with_name(SPARSE), num_cameras)
+    except (OSError, MeshFileError):
+        return np.zeros((0, 3)), np.zeros((0, len(columns)), bool)
+    visibility = visibility[:, list(columns)]
+    shared = visibility.sum(axis=1) >= 2
+    return positions[shared], visibility[shared]
 
 
 def _model(folder: Path) -> pycolmap.Reconstruction:
@@ -183,9 +219,13 @@ def _from_model(photos: Sequence[Photo], folder: Path) -> Placement:
     )
 
 
-def _matched(photos: Sequence[Photo], camera_paths: Sequence[str], source: Path) -> dict[int, int]:
-    photo_paths = [photo.path.as_posix() for photo in photos]
-    matched = match_by_name(photo_paths, camera_paths)
+def _matched(
+    photos: Sequence[Photo], camera_paths: Sequence[str], source: Path, *, left_out: Collection[int] = ()
+) -> dict[int, int]:
+    """Index of the camera for each photograph that has one, but for those left out."""
+    rest = [index for index in range(len(photos)) if index not in left_out]
+    found = match_by_name([photos[index].path.as_posix() for index in rest], camera_paths)
+    matched = {rest[photo]: camera for photo, camera in found.items()}
     if not matched:
         theirs = camera_paths[0] if camera_paths else "nothing"
         text = (
@@ -195,12 +235,13 @@ def _matched(photos: Sequence[Photo], camera_paths: Sequence[str], source: Path)
     return matched
 
 
-def _unplaced(photos: Sequence[Photo], matched: Mapping[int, int], source: Path) -> tuple[Unplaced, ...]:
-    """The photographs that no camera is named like."""
-    why = f"no camera in {source.name} has its name"
-    return tuple(
-        Unplaced(name=photo.name, why=why) for index, photo in enumerate(photos) if index not in matched
-    )
+def _unplaced(
+    photos: Sequence[Photo], matched: Mapping[int, int], source: Path, why: Mapping[int, str] = _NOTHING
+) -> tuple[Unplaced, ...]:
+    """The photographs that no camera is named like, and why where that is known."""
+    unnamed = f"no camera in {source.name} has its name"
+    rest = (index for index in range(len(photos)) if index not in matched)
+    return tuple(Unplaced(name=photos[index].name, why=why.get(index, unnamed)) for index in rest)
 
 
 def _likeness(photo_path: str, camera_path: str) -> int:
@@ -229,7 +270,7 @@ def _placed(index: int, photo: Photo, lens: pycolmap.Camera, pose: Float64[np.nd
         text = f"The camera of {photo.name} is a panorama ({lens.model.name}), which cannot be used."
         raise _unusable(text, "Give photographs and cameras of one direction each.")
     if not np.isfinite(lens.params).all() or min(lens.focal_length_x, lens.focal_length_y) <= 0:
-        raise _unusable(f"The focal length or distortion of {photo.name} is no usable number.")
+        raise _unusable(f"The focal length or distortion of {photo.name} is not finite and positive.")
     return PlacedPhoto(index=index, lens=lens, camera_from_world=checked_pose(pose, photo.name))
 
 

@@ -78,6 +78,8 @@ class Placement:
     """In pixels of the photographs; None where the cameras were given."""
     evidence: CameraEvidence | None = None
     """The same."""
+    estimated: bool = False
+    """Whether FewView found the cameras from the photographs, be it in an earlier job."""
     decisions: tuple[Decision, ...] = ()
 
 

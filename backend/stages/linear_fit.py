@@ -40,6 +40,14 @@ class LinearConfig:
     """Of the level before, at 32 nodes; more than 0."""
     settled: float = 0.005
     """Movement of the surface in a round, in cells on average, below which no further round is asked for."""
+    spread_cells: float = 1.0
+    """How far points speak across their normals; twice as far along them."""
+    confidence_power: float = 3.0
+    """Points weigh as this power of their confidence."""
+    correlated: bool = True
+    """Neighbouring pixels are matched by nearly the same windows: their errors are one error."""
+    ball: float | None = None
+    """Radius of the ball behind, in half widths of the subject; None to find it out."""
 
 
 def start(scene: Measurements, radius: float, nodes: int) -> Float[Tensor, "nodes nodes nodes"]:
@@ -62,9 +70,9 @@ def fit_level(
     """
     nodes = before.shape[0]
     h = spacing(nodes)
-    # neighbouring pixels are matched by nearly the same windows: their errors are one error
-    points = merged_points(scene.positions, scene.normals, scene.confidence**3, h / 2, correlated=True)
-    measured = point_distances(*points, nodes)
+    sure = scene.confidence**config.confidence_power
+    points = merged_points(scene.positions, scene.normals, sure, h / 2, correlated=config.correlated)
+    measured = point_distances(*points, nodes, spread_cells=config.spread_cells)
     measured_weight = measured.weight.clamp(max=4.0)
     ball = ball_behind(scene, radius, nodes)
     bound = least_distance(scene, nodes)

@@ -9,8 +9,7 @@ from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 
 from ..maths.geometry import Pinhole, pinhole_in_object
-from ..scene import Region, View
-from .stereo import DepthMap, StereoResult
+from ..scene import DepthMap, Region, StereoResult, View
 
 SURE = 0.3
 """Confidence of a depth that carves, or that opens a scene at the pictures' edges.

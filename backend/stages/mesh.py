@@ -18,10 +18,19 @@ from ..maths.grid import near_surface, refined, spacing
 from ..maths.nearest import nearest_tree
 from ..maths.pieces import connected_pieces
 from ..maths.raycast import RayCaster, visible_from
-from ..scene import Decision, Progress, Region, SurfaceMesh, View, transform_points
+from ..scene import (
+    Decision,
+    DepthMap,
+    Progress,
+    Region,
+    StereoResult,
+    SurfaceMesh,
+    View,
+    transform_points,
+    within,
+)
 from .measurements import SURE
-from .stereo import DepthMap, StereoResult
-from .train import Surface
+from .surface import Surface
 from .vertex_colours import colour_vertices
 
 Vertices = Float64[np.ndarray, "vertices 3"]
@@ -40,6 +49,9 @@ MEASURED_EDGES = 0.03
 _LEAST_CELLS = 1e-3
 """How near to a node, in cells, the level set may cross an edge: through a node it has faces without area."""
 
+_SHORTEST = 1e-6
+"""Edges of a simplified mesh, in shares of its size: on sides that are exactly flat some have no length."""
+
 PREVIEW_NODES, PREVIEW_FACES = 64, 20_000
 """Of a mesh that is only looked at: at most so many nodes along each axis, and faces."""
 
@@ -51,6 +63,10 @@ class MeshConfig:
     max_faces: int = 200_000
     smallest_piece: float = 0.02
     """Pieces with a smaller share of the largest one's area are dropped as floating."""
+    subdivided: bool = True
+    """Whether a mesh of few faces gets more of them, for colour."""
+    exposures_evened: bool = True
+    """Whether photographs of other exposure or white balance are brought to the mean of all, for colour."""
 
 
 def extract_mesh(
@@ -66,15 +82,10 @@ def extract_mesh(
 
     Raises ReconstructionError(NO_SURFACE) if the field has no zero level.
     """
-    progress(0.0, "level set")
-    vertices, faces = level_set(surface)
-    faces = without_small_pieces(vertices, faces, config.smallest_piece)
-    vertices, faces = only_used(vertices, faces)
-    progress(0.2, "simplifying")
-    vertices, faces = simplified(vertices, faces, config.max_faces)
+    vertices, faces = simplified_level_set(surface, config, progress=within(progress, 0.0, 0.4))
     progress(0.4, "support")
     points = transform_points(region.world_from_object, stereo.points.positions.astype(np.float64))
-    cell = spacing(surface.distance.shape[0]) / np.cbrt(np.linalg.det(surface.grid_from_world[:3, :3]))
+    cell = surface.cell_world
     cameras = [view.camera for view in views]
 
     def backing(vertices: Vertices, faces: Faces) -> _Backing:
@@ -92,12 +103,16 @@ def extract_mesh(
     used = np.unique(faces[kept])
     vertices, faces = only_used(vertices, faces[kept])
     normals, seen, support = normals[used], seen[used], support[used]
-    if 4 * len(faces) <= config.max_faces:
-        # room for more vertices is room for colour: photographs are finer than the grid
+    if config.subdivided and 2 * len(faces) <= config.max_faces:
+        # Room for more vertices is room for colour: photographs are finer than the grid. Flat places lose
+        # faces first, so that as many as there is room for carry more colour and hardly less shape.
+        vertices, faces = simplified(vertices, faces, config.max_faces // 4)
         vertices, faces = trimesh.remesh.subdivide(vertices, faces)  # type: ignore[no-untyped-call]
         normals, seen, support = backing(vertices, faces)
     progress(0.7, "colour")
-    colours, exposure = colour_vertices(vertices, normals, seen, views)
+    colours, exposure = colour_vertices(
+        vertices, normals, seen, views, exposures_evened=config.exposures_evened
+    )
     decisions = (*decisions, exposure)
     return SurfaceMesh(
         vertices=vertices,
@@ -137,6 +152,21 @@ def preview_mesh(
         colours_srgb=colours,
         support=np.zeros(len(vertices), np.float32),
     )
+
+
+def simplified_level_set(
+    surface: Surface, config: MeshConfig, *, progress: Progress
+) -> tuple[Vertices, Faces]:
+    """The zero level without small pieces, of `max_faces` at most, world frame.
+
+    Raises ReconstructionError(NO_SURFACE) if the field has no zero level.
+    """
+    progress(0.0, "level set")
+    vertices, faces = level_set(surface)
+    faces = without_small_pieces(vertices, faces, config.smallest_piece)
+    vertices, faces = only_used(vertices, faces)
+    progress(0.5, "simplifying")
+    return simplified(vertices, faces, config.max_faces)
 
 
 def level_set(surface: Surface) -> tuple[Vertices, Faces]:
@@ -214,10 +244,27 @@ def simplified(vertices: Vertices, faces: Faces, max_faces: int) -> tuple[KeptVe
         points, fewer = fast_simplification.simplify(
             unit, faces.astype(np.int32), target_count=target, agg=5, lossless=False
         )
+        fewer = without_short_edges(points.astype(np.float64), fewer.astype(np.int64), _SHORTEST)
         if not closed or trimesh.Trimesh(points, fewer, process=False).is_watertight:
-            return only_used(points.astype(np.float64) * size + middle, fewer.astype(np.int64))
+            return only_used(points.astype(np.float64) * size + middle, fewer)
         target *= 2
     return vertices, faces
+
+
+def without_short_edges(vertices: Vertices, faces: Faces, shortest: float) -> KeptFaces:
+    """Faces where the ends of each edge that is not longer than `shortest` are one vertex.
+
+    The faces at such an edge have no area, and go; those around close over it.
+    """
+    edges = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
+    short = np.linalg.norm(vertices[edges[:, 0]] - vertices[edges[:, 1]], axis=1) <= shortest
+    if not short.any():
+        return faces
+    piece = connected_pieces(edges[short].T, len(vertices))
+    _, first = np.unique(piece, return_index=True)
+    joined = first[piece][faces]
+    apart = (joined != np.roll(joined, 1, axis=1)).all(axis=1)
+    return np.asarray(joined[apart], np.int64)
 
 
 def vertex_normals(vertices: Vertices, faces: Faces) -> Float64[np.ndarray, "vertices 3"]:

@@ -10,7 +10,7 @@ take them for something else.
 import json
 import math
 from collections.abc import Mapping
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +31,28 @@ _COLMAP_PARAMS = "colmap_params"
 
 Frame = Mapping[str, Any]
 """One frame's entries over those at the top of the file."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Estimate:
+    """What FewView's own cameras.json says of cameras that it estimated."""
+
+    reprojection_error_px: float | None
+    why_unplaced: Mapping[str, str]
+    """By the name of each photograph that could not be placed."""
+
+
+def estimate_or_none(path: Path) -> Estimate | None:
+    """What `transforms_json` left in the file; None where the cameras come from elsewhere, or were given."""
+    ours = json.loads(path.read_text(encoding="utf-8")).get("fewview")
+    if not isinstance(ours, dict) or ours.get("estimated") is not True:
+        return None
+    error_px, unplaced = ours.get("reprojection_error_px"), ours.get("unplaced")
+    entries = [entry for entry in unplaced if isinstance(entry, dict)] if isinstance(unplaced, list) else []
+    return Estimate(
+        reprojection_error_px=error_px if isinstance(error_px, float) and math.isfinite(error_px) else None,
+        why_unplaced={str(entry.get("name")): str(entry.get("why")) for entry in entries},
+    )
 
 
 def read_frames(path: Path) -> list[Frame]:
@@ -172,7 +194,7 @@ def _number(frame: Frame, key: str, photo: Photo, default: float) -> float:
     if value is None:
         return default
     if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-        raise _unusable(f"The camera of {photo.name} has {key} = {value}, which is no usable number.")
+        raise _unusable(f"The camera of {photo.name} has {key} = {value}, which is not a finite number.")
     return float(value)
 
 

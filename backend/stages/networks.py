@@ -13,6 +13,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from ..maths.encoding import positional_encoding
+from ..maths.harmonics import NUM_HARMONICS, spherical_harmonics
 from ..maths.hash_grid import encode, level_cells, table_rows
 
 _STEEPNESS = 100.0
@@ -38,7 +39,7 @@ class HashConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class NetworkConfig:
-    """Sizes; the published ones stand in docs/method.md."""
+    """Sizes; the published ones are those of the presets that are named so."""
 
     width: int = 64
     layers: int = 4
@@ -49,6 +50,12 @@ class NetworkConfig:
     """Hidden layers of each network of colour."""
     frequencies: int = 4
     """Of the positional encoding of places; not used with a hash grid."""
+    longest_wave: float = 2.0
+    """Of positional encodings, object units: 2 for sin(2^k pi x), 2 pi for NeuS's sin(2^k x)."""
+    direction_frequencies: int = 2
+    """Of the positional encoding of directions."""
+    spherical_harmonics: bool = False
+    """Of directions, in place of their positional encoding."""
     hash_grid: HashConfig | None = None
     albedo_and_specular: bool = False
     """Colour as the sum of what all directions see and a grey gloss, in logits; else one network of all."""
@@ -176,7 +183,7 @@ class NeuralSurface(nn.Module):
 
     def __init__(self, config: NetworkConfig, generator: torch.Generator) -> None:
         super().__init__()
-        self.frequencies = config.frequencies
+        self.config = config
         self.cells: tuple[int, ...] = ()
         grid = config.hash_grid
         encoded = 6 * config.frequencies
@@ -189,7 +196,7 @@ class NeuralSurface(nn.Module):
                 # Instant-NGP, section 4: nearly nothing, but not the same everywhere
                 self.tables.append(nn.Parameter(1e-4 * (2 * torch.rand(shape, generator=generator) - 1)))
         self.distance_network = DistanceNetwork(config, encoded, generator)
-        views = 3 + 6 * _VIEW_FREQUENCIES
+        views = NUM_HARMONICS if config.spherical_harmonics else 3 + 6 * config.direction_frequencies
         split = config.albedo_and_specular
         seen_by_all, seen_from_one = 3 + config.features, 6 + config.features + views
         self.albedo = ColourNetwork(seen_by_all, 3, config, generator) if split else None
@@ -202,7 +209,7 @@ class NeuralSurface(nn.Module):
         if self.cells:
             encoded = encode(list(self.tables), self.cells, points, active)
         else:
-            encoded = positional_encoding(points, self.frequencies)
+            encoded = self._waves(points, self.config.frequencies)
         found: tuple[Tensor, Tensor] = self.distance_network(points, encoded)
         return found
 
@@ -222,13 +229,16 @@ class NeuralSurface(nn.Module):
         directions: Float[Tensor, "points 3"],
     ) -> Seen:
         """Colour on the way along unit directions."""
-        views = torch.cat([directions, positional_encoding(directions, _VIEW_FREQUENCIES)], dim=-1)
+        if self.config.spherical_harmonics:
+            views = spherical_harmonics(directions)
+        else:
+            waves = self._waves(directions, self.config.direction_frequencies)
+            views = torch.cat([directions, waves], dim=-1)
         directed: Tensor = self.directed(torch.cat([points, features, normals, views], dim=-1))
         if self.albedo is None:
             return Seen(colour=torch.sigmoid(directed), gloss=None)
         logits = self.all_round(points, features) + directed
         return Seen(colour=torch.sigmoid(logits), gloss=directed[:, 0])
 
-
-_VIEW_FREQUENCIES = 2
-"""Of the positional encoding of directions; with the factor pi that ours has, the published four."""
+    def _waves(self, x: Float[Tensor, "points 3"], frequencies: int) -> Float[Tensor, "points waves"]:
+        return positional_encoding(x * (2 / self.config.longest_wave), frequencies)

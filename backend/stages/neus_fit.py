@@ -16,25 +16,22 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from ..errors import ErrorCode, ReconstructionError
 from ..maths.hash_grid import level_cells
 from ..maths.rays import DistanceFunction
-from ..scene import Decision, Progress, Region, View
+from ..scene import Decision, Progress, Region, StereoResult, View
 from .deadline import Clock, Deadline, GridCost, deadline_after, predicted_s
 from .field_surface import field_surface, surface_in
 from .measurements import Measurements, measurements
 from .networks import NetworkConfig, NeuralSurface
 from .neus_losses import Moment, Sampling, Weights, measured_points, point_loss, ray_loss
 from .pixels import pixels_of_unit_sphere
-from .stereo import StereoResult
-from .train import COARSEST, ShowSurface, Surface, show_nothing
+from .safe_steps import SafeSteps
+from .surface import COARSEST, ShowSurface, Surface, show_nothing
 
 _SOFTEST, _SHARPEST = math.log(10.0), math.log(2048.0)
 """Logs of the sharpness, 1 / object unit. What is sharper than samples are dense gets no gradient."""
 _ALL_LEVELS_AT = 0.78
 """Share of a run after which all levels of a hash grid count: 3100 of 4000 steps."""
-_SHARPNESS_RATE = 1e-2
-"""Size of steps of the log of the sharpness."""
 _LONGEST = 10.0
 """Length that gradients are cut to."""
 _SHOWN = 10
@@ -50,10 +47,16 @@ class NeusConfig:
     sampling: Sampling = field(default_factory=Sampling)
     weights: Weights = field(default_factory=Weights)
     learning_rate: float = 2e-3
+    sharpness_rate: float = 1e-2
+    """Of the log of the sharpness."""
     warm_up: float = 1 / 60
     """Share of the run in which steps grow."""
     constant: float = 0.0
-    """Share of the run until which steps stay as they are; then they shrink to a twentieth."""
+    """Share of the run until which steps stay as they are; then they shrink."""
+    last_rate: float = 0.05
+    """What is left of the size of steps at the end."""
+    exponential: bool = False
+    """Whether they shrink by the same factor everywhere, else by a cosine."""
     slope_annealed_at: float = 1 / 6
     """Share of the run after which surface seen from behind absorbs no more."""
     nodes: int = 128
@@ -93,8 +96,8 @@ def fit_neus(
 ) -> Surface:
     """The learned distance on a grid laid tightly around its zero level.
 
-    A step whose loss or gradient is not finite is not taken; a decision says how many there were.
-    Raises ReconstructionError(NO_SURFACE) if none could be taken, or nothing of the region is inside.
+    A step whose loss or gradient is not finite is taken back; a decision says how many there were.
+    Raises ReconstructionError(NO_SURFACE) if that happens again and again, or nothing is inside.
     """
     deadline = deadline_after(config.budget_s, clock)
     progress(0.0, "making networks")
@@ -105,22 +108,15 @@ def fit_neus(
     show(look(model.distance(active_levels(config.network, 1.0))))
     sampled = GridCost(nodes=COARSEST, seconds=clock() - began_s)
     learning = replace(deadline, at_s=deadline.at_s - predicted_s([sampled], config.nodes))
-    taken, skipped = _learn(
-        model, scene, config, generator, progress, learning, lambda distance: show(look(distance))
-    )
-    if not taken:
-        raise ReconstructionError(
-            ErrorCode.NO_SURFACE,
-            "Nothing could be learned from the photographs: every step of the fit gave numbers without end.",
-            "Check that the photographs open in a viewer, or use another preset.",
-        )
+    steps = _learn(model, scene, config, generator, progress, learning, lambda distance: show(look(distance)))
+    steps.raise_if_nothing_was_learned()
     progress(1.0, f"sampling the distance on {config.nodes}^3")
     distance = model.distance(active_levels(config.network, 1.0))
     surface = field_surface(distance, region, config.nodes, device)
-    made = _decisions(model, scene, config, taken=taken, skipped=skipped)
+    made = _decisions(model, scene, config, steps)
     if config.budget_s is not None:
         used_s = config.budget_s - deadline.left_s()
-        made = (*made, _of_budget(config, taken + skipped, used_s))
+        made = (*made, _of_budget(config, steps.steps, used_s))
     return replace(surface, decisions=made)
 
 
@@ -132,24 +128,25 @@ def _learn(
     progress: Progress,
     deadline: Deadline,
     show: Callable[[DistanceFunction], None],
-) -> tuple[int, int]:
-    """Take steps until all are taken or the time is over; how many were taken, how many were not finite."""
+) -> SafeSteps:
+    """Take steps until all are taken, the time is over, or there is no hope."""
     pixels = pixels_of_unit_sphere(scene)
     measured = measured_points(scene) if config.weights.points else None
-    rates = (config.learning_rate, _SHARPNESS_RATE)
     optimiser = torch.optim.Adam(
         [
-            {"params": [*model.surface.parameters(), model.background]},
-            {"params": [model.log_sharpness]},
+            {"params": [*model.surface.parameters(), model.background], "lr": config.learning_rate},
+            {"params": [model.log_sharpness], "lr": config.sharpness_rate},
         ],
         betas=(0.9, 0.99),
         eps=1e-12,
     )
+    safe = SafeSteps(optimiser, longest=_LONGEST)
     began_s = deadline.clock()
-    taken, skipped, done = 0, 0, 0.0
-    while done < 1:
-        if (taken + skipped) % 10 == 0:
-            progress(done, f"step {taken + skipped} of {config.steps}")
+    done = 0.0
+    while done < 1 and not safe.hopeless:
+        if safe.steps % 10 == 0:
+            progress(done, f"step {safe.steps} of {config.steps}")
+            safe.keep()
         moment = _moment(config, done, model.log_sharpness.exp())
         background = torch.sigmoid(model.background)
         loss = ray_loss(
@@ -159,22 +156,13 @@ def _learn(
             loss = loss + point_loss(
                 model.surface, measured, moment, config.sampling, config.weights, generator
             )
-        optimiser.zero_grad(set_to_none=True)
-        torch.autograd.backward(loss)
-        for group, rate in zip(optimiser.param_groups, rates, strict=True):
-            group["lr"] = rate * rate_share(config, done)
-        length = torch.nn.utils.clip_grad_norm_(model.parameters(), _LONGEST)
-        if (loss + length).isfinite():  # a loss that is not may have gradients that are
-            optimiser.step()
-            taken += 1
-        else:
-            skipped += 1
+        safe.take(loss, rate_share(config, done))
         with torch.no_grad():
             model.log_sharpness.clamp_(_SOFTEST, _SHARPEST)
-        before, done = done, max((taken + skipped) / config.steps, deadline.share_gone(began_s))
+        before, done = done, max(safe.steps / config.steps, deadline.share_gone(began_s))
         if int(before * _SHOWN) < int(done * _SHOWN) < _SHOWN:
             show(model.distance(moment.active))
-    return taken, skipped
+    return safe
 
 
 def _moment(config: NeusConfig, done: float, sharpness: Float[Tensor, ""]) -> Moment:
@@ -197,32 +185,34 @@ def active_levels(config: NetworkConfig, done: float) -> int:
 
 
 def rate_share(config: NeusConfig, done: float) -> float:
-    """Size of steps: grows at first, then is constant, then falls to a twentieth by a cosine."""
-    grown = min(1.0, 0.01 + done / config.warm_up)
+    """Size of steps: grows at first, then is constant, then falls to `last_rate`."""
+    grown = min(1.0, 0.01 + done / config.warm_up) if config.warm_up else 1.0
     falling = max(0.0, done - config.constant) / (1 - config.constant)
-    return grown * (0.05 + 0.95 * 0.5 * (1 + math.cos(math.pi * falling)))
+    if config.exponential:
+        return float(grown * config.last_rate**falling)
+    return grown * (config.last_rate + (1 - config.last_rate) * 0.5 * (1 + math.cos(math.pi * falling)))
 
 
 def finest_detail(config: NetworkConfig, active: int) -> float:
     """Width of a cell of the last active level of the hash grid, or half the shortest wave; object units."""
     grid = config.hash_grid
     if grid is None:
-        return 2.0 ** (1 - config.frequencies)
+        return config.longest_wave / 2.0**config.frequencies
     return 2.0 / level_cells(grid.levels, grid.coarsest, grid.finest)[active - 1]
 
 
 def _decisions(
-    model: _Model, scene: Measurements, config: NeusConfig, *, taken: int, skipped: int
+    model: _Model, scene: Measurements, config: NeusConfig, steps: SafeSteps
 ) -> tuple[Decision, ...]:
     """What was modelled, with what it was decided by."""
     masks = sum(mask is not None for mask in scene.masks)
-    grid = config.network.hash_grid
-    steps = f"{taken} steps of {config.sampling.rays} rays"
+    network, grid = config.network, config.network.hash_grid
     return (
         Decision(
             what="method",
             choice="NeuS" if grid is None else "SparseCraft",
-            because="the preset; for comparison, smaller than published and slower than the default",
+            because="the preset; for comparison, slower than the default. The distance has "
+            f"{network.layers} hidden layers of {network.width}",
         ),
         Decision(
             what="silhouettes",
@@ -236,9 +226,8 @@ def _decisions(
         ),
         Decision(
             what="refinement by rendering",
-            choice=steps + (f", {skipped} not taken" if skipped else ""),
-            because=f"the sharpness reached {model.log_sharpness.exp().item():.0f} per region's radius"
-            + ("; steps that were not finite are not taken" if skipped else ""),
+            choice=f"{steps.steps} steps of {config.sampling.rays} rays{steps.told}",
+            because=f"the sharpness reached {model.log_sharpness.exp().item():.0f} per region's radius",
         ),
     )
 

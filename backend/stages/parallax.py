@@ -9,7 +9,7 @@ import pycolmap
 from jaxtyping import Float64
 
 from ..errors import ErrorCode, ReconstructionError
-from ..maths.angles import widest_angle_deg
+from ..maths.angles import triangulation_angle_deg
 
 _SMALLEST_ANGLE_DEG = 1.0
 _SMALLEST_ANGLE_FLAT_DEG = 2.0
@@ -99,9 +99,10 @@ def require_parallax(model: pycolmap.Reconstruction, database: Path) -> None:
 def widest_angles_deg(model: pycolmap.Reconstruction) -> Float64[np.ndarray, "points"]:
     """For each point, the widest angle between the rays to it."""
     centres = {i: model.images[i].projection_center() for i in model.reg_image_ids()}
-    angles = []
-    for point in model.points3D.values():
-        rays = np.stack([centres[element.image_id] - point.xyz for element in point.track.elements])
-        rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-        angles.append(widest_angle_deg(rays))
-    return np.array(angles, np.float64)
+    angles = (
+        triangulation_angle_deg(
+            point.xyz, np.stack([centres[seen.image_id] for seen in point.track.elements])
+        )
+        for point in model.points3D.values()
+    )
+    return np.fromiter(angles, np.float64)

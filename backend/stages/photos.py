@@ -1,8 +1,7 @@
 """First stage: photographs from files, upright and at working size, each with its mask."""
 
 import re
-from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,8 +11,7 @@ from jaxtyping import Float32
 from ..errors import ErrorCode, ReconstructionError
 from ..images import DecodedImage, read_image, resized, same_shape
 from ..scene import Photo, Progress
-
-PHOTO_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp"})
+from ..wire.photographs import names_of, photographs_in
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,14 +34,19 @@ def load_photos(
     A mask in masks_folder counts before the alpha channel. Photographs without either have no mask.
     Raises ReconstructionError: NO_PHOTOS, TOO_FEW_PHOTOS, PHOTO_UNREADABLE, MASK_UNUSABLE.
     """
-    paths = find_photos(sources)
-    names = _unique_names(paths)
-    masks = {} if masks_folder is None else match_masks(names, masks_folder)
+    files = named_photos(sources)
+    masks = {} if masks_folder is None else match_masks(tuple(files), masks_folder)
     photos = []
-    for index, (path, name) in enumerate(zip(paths, names, strict=True)):
-        progress(index / len(paths), f"Reading {name}")
+    for index, (name, path) in enumerate(files.items()):
+        progress(index / len(files), f"Reading {name}")
         photos.append(_load_photo(path, name, masks.get(name), config))
     return tuple(photos)
+
+
+def named_photos(sources: Sequence[Path]) -> dict[str, Path]:
+    """The files that `find_photos` finds, in its order, by the names that the photographs have."""
+    paths = find_photos(sources)
+    return dict(zip(names_of(paths), paths, strict=True))
 
 
 def find_photos(sources: Sequence[Path]) -> list[Path]:
@@ -54,7 +57,7 @@ def find_photos(sources: Sequence[Path]) -> list[Path]:
             raise ReconstructionError(
                 ErrorCode.NO_PHOTOS, f"There is no file or folder {source}.", "Check the path."
             )
-        members = [path for path in source.iterdir() if _is_photo(path)] if source.is_dir() else [source]
+        members = photographs_in(source) if source.is_dir() else [source]
         found.update({path.resolve(): path for path in members})
     if not found:
         places = ", ".join(str(source) for source in sources) or "the list"
@@ -63,7 +66,9 @@ def find_photos(sources: Sequence[Path]) -> list[Path]:
     if len(found) == 1:
         text = "There is only one photograph."
         raise ReconstructionError(
-            ErrorCode.TOO_FEW_PHOTOS, text, "Take at least three, from different places."
+            ErrorCode.TOO_FEW_PHOTOS,
+            text,
+            "Take at least two, or better three or more, from different places.",
         )
     return sorted(found.values(), key=lambda path: (natural_order(path.name), str(path)))
 
@@ -82,7 +87,7 @@ def match_masks(names: Sequence[str], masks_folder: Path) -> dict[str, Path]:
     if not masks_folder.is_dir():
         text = f"There is no folder {masks_folder} with masks."
         raise ReconstructionError(ErrorCode.MASK_UNUSABLE, text, "Check the path.")
-    by_stem = {path.stem.lower(): path for path in sorted(masks_folder.iterdir()) if _is_photo(path)}
+    by_stem = {path.stem.lower(): path for path in sorted(photographs_in(masks_folder))}
     matched = {}
     for name in names:
         base = Path(name)
@@ -95,18 +100,6 @@ def match_masks(names: Sequence[str], masks_folder: Path) -> dict[str, Path]:
         remedy = f"Name the mask of {names[0]} {Path(names[0]).stem}.png."
         raise ReconstructionError(ErrorCode.MASK_UNUSABLE, text, remedy)
     return matched
-
-
-def _is_photo(path: Path) -> bool:
-    return path.suffix.lower() in PHOTO_SUFFIXES and not path.name.startswith(".") and path.is_file()
-
-
-def _unique_names(paths: Sequence[Path]) -> list[str]:
-    """File names, with the folder's where two are the same, and a number where that is not enough."""
-    count: Mapping[str, int] = Counter(path.name for path in paths)
-    names = [path.name if count[path.name] == 1 else f"{path.parent.name}/{path.name}" for path in paths]
-    again = Counter(names)
-    return [name if again[name] == 1 else f"{index}/{name}" for index, name in enumerate(names, start=1)]
 
 
 def _load_photo(path: Path, name: str, mask_path: Path | None, config: PhotosConfig) -> Photo:

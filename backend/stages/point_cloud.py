@@ -10,11 +10,13 @@ from jaxtyping import Float64
 
 from ..errors import ErrorCode, ReconstructionError
 from ..maths.metrics import READ_FAILURES
+from ..point_methods import FEWEST_POINTS
 from ..scene import Decision
 
-FEWEST_POINTS = 30
 _FLATTEST = 1e-6
 """Thickness over width; below, all points lie in one plane, to the precision of files."""
+_LARGEST = 1e100
+"""Of a coordinate: with larger ones areas and volumes are not finite."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,11 +46,12 @@ def read_cloud(path: Path) -> PointCloud:
 def clean_cloud(
     positions: Float64[np.ndarray, "points 3"], normals: Float64[np.ndarray, "points 3"] | None
 ) -> PointCloud:
-    """The cloud without points that are not finite and without repeated ones.
+    """The cloud without points that are not finite, or too large to reckon with, and without repeated ones.
 
-    Raises ReconstructionError(CLOUD_UNUSABLE) if fewer than FEWEST_POINTS are left or all lie in a plane.
+    A normal that is not finite is none. Raises ReconstructionError(CLOUD_UNUSABLE) if fewer than
+    FEWEST_POINTS points are left or all lie in a plane.
     """
-    finite = np.isfinite(positions).all(axis=1)
+    finite = (np.abs(positions) <= _LARGEST).all(axis=1)  # false for NaN
     _, first = np.unique(positions[finite], axis=0, return_index=True)
     kept = np.flatnonzero(finite)[np.sort(first)]
     decisions = []
@@ -63,14 +66,39 @@ def clean_cloud(
             f"The cloud has {len(kept)} different points with finite coordinates; {FEWEST_POINTS} are needed."
         )
     positions = positions[kept]
-    sizes = np.linalg.svd(positions - positions.mean(axis=0), compute_uv=False)
-    if sizes[2] <= _FLATTEST * sizes[0]:
+    if _flatness(positions) <= _FLATTEST:
         raise _unusable("All points of the cloud lie in one plane: nothing tells what they enclose.")
     if normals is not None:
-        normals = np.nan_to_num(normals[kept], nan=0.0, posinf=0.0, neginf=0.0)
-        lengths = np.linalg.norm(normals, axis=1, keepdims=True)
-        normals = normals / np.where(lengths > 0, lengths, 1.0)
+        normals = normals[kept]
+        known = np.isfinite(normals).all(axis=1)
+        if not known.all():
+            choice = f"{int((~known).sum())} of {len(known)} left out"
+            decisions.append(
+                Decision(what="normals that are not finite", choice=choice, because="their points are kept")
+            )
+        normals = _unit(np.where(known[:, None], normals, 0.0))
     return PointCloud(positions=positions, normals=normals, decisions=tuple(decisions))
+
+
+def _flatness(positions: Float64[np.ndarray, "points 3"]) -> float:
+    """Thickness over width of a cloud in which a few points may be strays, however far away.
+
+    A point weighs less the farther it is from the middle, beyond half of the points: in the sum of squares a
+    single one, such as a scanner's mark for "nothing seen", makes a line of any cloud.
+    """
+    far = np.abs(positions - np.median(positions, axis=0)).max(axis=1)
+    usual = np.median(far)
+    weight = (usual / np.clip(far, usual, None))[:, None]
+    middle = (weight * positions).sum(axis=0) / weight.sum()
+    sizes = np.linalg.svd(weight * (positions - middle), compute_uv=False)
+    return float(sizes[2] / sizes[0])
+
+
+def _unit(vectors: Float64[np.ndarray, "vectors 3"]) -> Float64[np.ndarray, "vectors 3"]:
+    """Of length one, or 0 as they were; a plain norm squares large and small numbers out of range."""
+    largest = np.abs(vectors).max(axis=1, keepdims=True)
+    scaled = vectors / np.where(largest > 0, largest, 1.0)
+    return np.asarray(scaled / np.where(largest > 0, np.linalg.norm(scaled, axis=1, keepdims=True), 1.0))
 
 
 def _read_ply(

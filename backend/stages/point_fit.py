@@ -19,10 +19,11 @@ from ..maths.grid import locate, refined, spacing, value_and_gradient
 from ..maths.neighbours import against_neighbours, neighbour_planes, trusts
 from ..maths.sides import Sides, sides_by_walking
 from ..maths.smooth_fit import fit_smooth
+from ..point_methods import PointMethod
 from ..scene import Decision, Progress, to_unit_sphere, transform_points, within
 from .point_cloud import PointCloud
-from .point_network import NetworkConfig, fit_network
-from .train import Surface
+from .point_network import LearnedField, NetworkConfig, fit_network
+from .surface import Surface
 
 _LEFT_OUT = 5
 """One point in so many is held out to choose the smoothness."""
@@ -46,8 +47,7 @@ _KNOWN = 0.5
 class PointFitConfig:
     """How the cloud is fitted."""
 
-    method: str = "linear"
-    """`linear`, or one of `point_network.METHODS`."""
+    method: PointMethod = PointMethod.LINEAR
     normals_known: bool = False
     """Whether the cloud's normals point outwards and are to be met."""
     nodes: int = 128
@@ -116,20 +116,22 @@ def fit_points(
     placed = transform_points(frame, positions)
     near = (np.abs(placed) < 1).all(axis=1)
     placed, trust = placed[near], trust[near]
-    if config.method == "linear":
+    if config.method == PointMethod.LINEAR:
         points = _points(placed, trust, None if normals is None else normals[near], device)
         distance, made = _fit_linear(points, config, generator=generator, progress=progress)
         decisions += made
     else:
         sure = torch.tensor(placed[trust > _SURE], dtype=torch.float32, device=device)
-        distance = fit_network(
+        learned = fit_network(
             sure, config.nodes, config.method, config.network, generator=generator, progress=progress
         )
+        distance = learned.distance
+        decisions.append(_of_learning("the network", config.network, learned))
     if not bool(distance.isfinite().all() & (distance < 0).any() & (distance > 0).any()):
         raise ReconstructionError(
             ErrorCode.NO_SURFACE,
             "No surface was found in the points.",
-            "Check that they lie on a surface; try another --method.",
+            "Check that they lie on a surface; try another method.",
         )
     return Surface(distance=distance.cpu().numpy(), grid_from_world=frame, decisions=tuple(decisions))
 
@@ -139,7 +141,7 @@ def _known_normals(cloud: PointCloud) -> Float64[np.ndarray, "points 3"]:
         raise ReconstructionError(
             ErrorCode.CLOUD_UNUSABLE,
             "The cloud has no normals, though they are said to be known.",
-            "Leave out --normals-known: a surface is found without them.",
+            "Do not say that they are known: a surface is found without them.",
         )
     return cloud.normals
 
@@ -181,7 +183,7 @@ def _fit_linear(
     learned = fit_network(
         sure,
         _COARSE[-1],
-        "neural-pull",
+        PointMethod.NEURAL_PULL,
         config.sides,
         generator=generator,
         progress=within(progress, 0.0, 0.6),
@@ -190,7 +192,7 @@ def _fit_linear(
         progress(0.6, "walking from side to side")
         known = points.trust > _KNOWN
         sides = sides_by_walking(
-            learned, points.positions[known], points.planes[known], points.flatness[known].square()
+            learned.distance, points.positions[known], points.planes[known], points.flatness[known].square()
         )
         progress(0.6, "choosing the smoothness")
         held = torch.randperm(len(points.positions), generator=generator) % _LEFT_OUT == 0
@@ -205,11 +207,12 @@ def _fit_linear(
         distance = _fit_levels(points, sides, levels, smoothness, config.prior)
     percent = 100 * missed / np.sqrt(12)  # of the cube's diagonal
     made = [
+        _of_learning("the sides' network", config.sides, learned),
         _decision(
             "smoothness",
             f"{smoothness:g}",
             f"one point in {_LEFT_OUT}, held out, is met to {percent:.2g} % of the cube's diagonal",
-        )
+        ),
     ]
     if config.normals_known and not points.signs_known:
         made.append(
@@ -273,6 +276,15 @@ def _distance_off(points: _Points, distance: Float[Tensor, "nodes nodes nodes"])
     value, gradient = value_and_gradient(distance, locate(points.positions, len(distance)))
     off = value.abs() / torch.linalg.vector_norm(gradient, dim=-1).clamp(min=0.3)
     return float((points.trust * off).sum() / points.trust.sum())
+
+
+def _of_learning(what: str, config: NetworkConfig, learned: LearnedField) -> Decision:
+    """How many steps a network took, and whether all of them went well."""
+    because = "the method's setting"
+    if learned.taken_back:
+        numbers = f"{learned.taken_back} steps led to numbers that are not finite"
+        because += f"; {numbers}, were taken back and shortened"
+    return _decision(what, f"{config.steps} steps", because)
 
 
 def _decision(what: str, choice: str, because: str) -> Decision:

@@ -14,10 +14,13 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn.functional import softplus
 
+from ..errors import ErrorCode, ReconstructionError
 from ..maths.grid import node_positions
 from ..maths.losses import entropy_of_side, log_mean_exp, newton_pull, pull, worst_offset
 from ..maths.nearest import nearest_tree
+from ..point_methods import PointMethod
 from ..scene import Progress
+from .safe_steps import SafeSteps
 
 NEIGHBOURS = 50
 """The distance to this neighbour is how far around a point queries are drawn (Ma et al.)."""
@@ -34,11 +37,12 @@ class NetworkConfig:
     """Published: 256."""
     layers: int = 4
     """Hidden ones. Published: 8."""
-    steps: int = 2000
+    steps: int = 1000
     """Published: 40 000."""
-    batch: int = 2000
+    batch: int = 500
     """Places a step, shared by the queries and what is tried around them. Published: 5000 queries."""
-    learning_rate: float = 1e-3
+    learning_rate: float = 3e-3
+    """Published: 1e-3."""
     warm_up: int = 100
     anywhere: float = 0.0
     """Queries all over the cube, over those around points: only they meet surface far from points."""
@@ -66,6 +70,16 @@ class Queries:
     nearest: Float[Tensor, "queries 3"]
     spread: Float[Tensor, "queries"]
     """Standard deviation of the noise that made the query from a point."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class LearnedField:
+    """What a network has learned, on a grid over the cube [-1, 1]^3."""
+
+    distance: Float[Tensor, "nodes nodes nodes"]
+    """> 0 outside; only for the entropy's it is no distance."""
+    taken_back: int
+    """Steps whose loss or gradient was not finite."""
 
 
 class PointNetwork(nn.Module):
@@ -96,26 +110,27 @@ class PointNetwork(nn.Module):
 def fit_network(
     points: Float[Tensor, "points 3"],
     nodes: int,
-    method: str,
+    method: PointMethod,
     config: NetworkConfig,
     *,
     generator: torch.Generator,
     progress: Progress,
-) -> Float[Tensor, "nodes nodes nodes"]:
-    """The field that a method's network has learned, on a grid over the cube [-1, 1]^3 that holds the points.
+) -> LearnedField:
+    """The field that a method's network has learned of points in the cube.
 
-    `method` is one of METHODS. The field is > 0 outside; only for the entropy's it is no distance.
+    `method` is one of METHODS. Raises ReconstructionError(NO_SURFACE) if too many steps were not finite.
     """
     step_loss = METHODS[method]
-    num_queries = config.batch // {"nap": 2, "sdro": 1 + config.draws}.get(method, 1)
+    num_queries = config.batch // {PointMethod.NAP: 2, PointMethod.SDRO: 1 + config.draws}.get(method, 1)
     queries = _draw_queries(points, config.anywhere, generator)
     network = PointNetwork(config.width, config.layers, generator).to(points.device)
     balance = nn.Parameter(torch.ones(2, device=points.device))  # NAP's own weights
     optimiser = torch.optim.Adam([*network.parameters(), balance], lr=config.learning_rate)
-    schedule = torch.optim.lr_scheduler.LambdaLR(optimiser, lambda step: _rate(step, config))
+    safe = SafeSteps(optimiser)
     for step in range(config.steps):
         if step % 10 == 0:
             progress(step / config.steps, f"step {step} of {config.steps}")
+            safe.keep()
         chosen = torch.randint(len(queries.positions), (num_queries,), generator=generator)
         batch = Queries(
             positions=queries.positions[chosen],
@@ -123,16 +138,19 @@ def fit_network(
             spread=queries.spread[chosen],
         )
         loss = step_loss(network, batch, balance, step / config.steps, config, generator)
-        optimiser.zero_grad()
-        loss.backward()  # type: ignore[no-untyped-call]
-        optimiser.step()
-        schedule.step()
+        safe.take(loss, _rate(step, config))
+        if safe.hopeless:
+            raise ReconstructionError(
+                ErrorCode.NO_SURFACE,
+                f"Nothing could be learned from the points: {safe.taken_back} steps were not finite.",
+                "Check that they lie on a surface; try another method.",
+            )
     with torch.no_grad():
         places = (
             node_positions(nodes, points.device).reshape(-1, 3).tensor_split(-(-(nodes**3) // _NODES_AT_ONCE))
         )
         values = torch.cat([network(part) for part in places])
-    return values.reshape(nodes, nodes, nodes)
+    return LearnedField(distance=values.reshape(nodes, nodes, nodes), taken_back=safe.taken_back)
 
 
 def _draw_queries(points: Float[Tensor, "points 3"], share: float, generator: torch.Generator) -> Queries:
@@ -249,9 +267,9 @@ def _entropy(
 _StepLoss = Callable[
     [PointNetwork, Queries, Tensor, float, NetworkConfig, torch.Generator], Float[Tensor, ""]
 ]
-METHODS: dict[str, _StepLoss] = {
-    "neural-pull": _neural_pull,
-    "nap": _nap,
-    "sdro": _sdro,
-    "entropy": _entropy,
+METHODS: dict[PointMethod, _StepLoss] = {
+    PointMethod.NEURAL_PULL: _neural_pull,
+    PointMethod.NAP: _nap,
+    PointMethod.SDRO: _sdro,
+    PointMethod.ENTROPY: _entropy,
 }

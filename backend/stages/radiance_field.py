@@ -147,7 +147,8 @@ def sample_rays(
     Without a generator places are not drawn but spread evenly. On a ray that misses the sphere all intervals
     have no length.
     """
-    shape, (rays, _) = field.shape, origins.shape
+    shape = field.shape
+    rays = len(origins)
     near, far = (end[:, None] for end in sphere_span(origins, directions))
     inner = strata(rays, shape.proposal_intervals - 1, generator, origins.device)
     proposal_edges = torch.cat([near, near + (far - near) * inner, far], dim=-1)

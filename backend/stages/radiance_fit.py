@@ -17,15 +17,14 @@ from ..errors import ErrorCode, ReconstructionError
 from ..maths.grid import spacing
 from ..maths.radiance import composite, proposal_loss, weight_bound
 from ..maths.volume import blending_weights
-from ..scene import Decision, Progress, Region, View
+from ..scene import Decision, Progress, Region, StereoResult, View
 from .deadline import PESSIMISM, Clock, deadline_after
 from .field_surface import field_surface
 from .measurements import Measurements, measurements
 from .pixels import Pixels, pixels_of_unit_sphere, rays_through
 from .radiance_field import RadianceField, RadianceShape, RaySamples, kept, sample_rays
 from .safe_steps import SafeSteps
-from .stereo import StereoResult
-from .train import COARSEST, ShowSurface, Surface, show_nothing
+from .surface import COARSEST, ShowSurface, Surface, show_nothing
 
 _FIRST_RATE, _LAST_RATE = 1e-2, 1e-3
 """Of Adam's steps."""
@@ -83,23 +82,18 @@ def fit_radiance(
     grid_s = PESSIMISM * (clock() - began_s) * (config.nodes**3 + COARSEST**3) / _POINTS_TIMED
     began_s = clock()
     steps_end = replace(deadline, at_s=deadline.at_s - min(grid_s, deadline.left_s() / 2))
-    step, done = 0, 0.0
+    done = 0.0
     safe = SafeSteps(optimiser)
-    while done < 1:
-        if step % 10 == 0:
-            progress(0.95 * done, f"fitting a radiance field, step {step} of {config.steps}")
+    while done < 1 and not safe.hopeless:
+        if safe.steps % 10 == 0:
+            progress(0.95 * done, f"fitting a radiance field, step {safe.steps} of {config.steps}")
             safe.keep()
         radiance.open_waves(done / _ALL_WAVES_AT)
         loss = _loss(radiance, backdrop, scene, pixels, config.rays, generator)
-        safe.take(loss, min(1.0, (step + 1) / _WARM_UP_STEPS) * (_LAST_RATE / _FIRST_RATE) ** done)
-        if safe.hopeless:
-            raise ReconstructionError(
-                ErrorCode.NO_SURFACE,
-                f"Nothing could be learned from the photographs: {safe.taken_back} steps were not finite.",
-                "Check that the photographs open in a viewer, or use another preset.",
-            )
-        step += 1
-        done = max(step / config.steps, steps_end.share_gone(began_s))
+        grown = min(1.0, (safe.steps + 1) / _WARM_UP_STEPS)
+        safe.take(loss, grown * (_LAST_RATE / _FIRST_RATE) ** done)
+        done = max(safe.steps / config.steps, steps_end.share_gone(began_s))
+    safe.raise_if_nothing_was_learned()
     radiance.open_waves(1.0)
     progress(0.95, "density on a grid")
     level = _level(radiance, scene, pixels)
@@ -109,7 +103,7 @@ def fit_radiance(
         distance=surface.distance,
         grid_from_world=surface.grid_from_world,
         radiance=kept(radiance, region, backdrop.learned_srgb()),
-        decisions=_decisions(config, backdrop, step, safe.taken_back, level),
+        decisions=_decisions(config, backdrop, safe, level),
     )
 
 
@@ -121,7 +115,7 @@ class _Backdrop(nn.Module):
         self.num_masked = len(torch.unique(pixels.view[~pixels.coverage.isnan()]))
         self.num_views = len(torch.unique(pixels.view))
         unmasked = pixels.colour[pixels.coverage.isnan()]
-        mean = unmasked.mean(dim=0) if len(unmasked) else pixels.colour.new_full((3,), 0.5)
+        mean = unmasked.nanmean(dim=0) if len(unmasked) else pixels.colour.new_full((3,), 0.5)
         self.logit = nn.Parameter(torch.logit(mean.clamp(0.02, 0.98)))
 
     def learned_srgb(self) -> Float[Tensor, "3"] | None:
@@ -198,16 +192,16 @@ def _level_surface(
 
 
 def _decisions(
-    config: RadianceConfig, backdrop: _Backdrop, steps: int, taken_back: int, level: float
+    config: RadianceConfig, backdrop: _Backdrop, safe: SafeSteps, level: float
 ) -> tuple[Decision, ...]:
-    not_finite = f", {taken_back} of which were not finite and were taken back" if taken_back else ""
     masked, views = backdrop.num_masked, backdrop.num_views
     colour = backdrop.learned_srgb()
     learned = "" if colour is None else " ".join(f"{round(255 * float(part))}" for part in colour)
     return (
         Decision(
             what="field",
-            choice=f"density and radiance, {steps} of {config.steps} steps of {config.rays} rays{not_finite}",
+            choice=f"density and radiance, {safe.steps} of {config.steps} steps of {config.rays} rays"
+            + safe.told,
             because="the preset asks for it" if config.budget_s is None else f"{config.budget_s:g} s given",
         ),
         Decision(

@@ -78,13 +78,17 @@ def _region(centre: Float64[np.ndarray, "3"], radius: float, choice: str, becaus
 
 def nearest_to_axes(cameras: list[Camera]) -> Float64[np.ndarray, "3"]:
     """The point with the least squared distance to all optical axes."""
-    system, right = np.zeros((3, 3)), np.zeros(3)
-    for camera in cameras:
-        axis = camera.camera_from_world[2, :3]
-        across = np.eye(3) - np.outer(axis, axis)
-        system += across
-        right += across @ camera.position
-    return np.asarray(np.linalg.lstsq(system, right, rcond=1e-9)[0])
+    axes = np.array([camera.camera_from_world[2, :3] for camera in cameras])
+    return _nearest_to_lines(np.array([camera.position for camera in cameras]), axes)
+
+
+def _nearest_to_lines(
+    origins: Float64[np.ndarray, "lines 3"], directions: Float64[np.ndarray, "lines 3"]
+) -> Float64[np.ndarray, "3"]:
+    """The point with the least squared distance to lines of unit directions."""
+    across = np.eye(3) - directions[:, :, None] * directions[:, None]
+    right = (across @ origins[:, :, None]).sum(axis=0)[:, 0]
+    return np.asarray(np.linalg.lstsq(across.sum(axis=0), right, rcond=1e-9)[0])
 
 
 def _of_cameras(cameras: list[Camera]) -> tuple[Float64[np.ndarray, "3"], float]:
@@ -228,8 +232,7 @@ def _without_ghosts(counts: Int64[np.ndarray, "x y z"]) -> Bool[np.ndarray, "x y
 
 def _first_guess(views: list[View]) -> tuple[Float64[np.ndarray, "3"], float]:
     """Where the rays through the middles of the masks meet, and how large the masks are there."""
-    system, right = np.zeros((3, 3)), np.zeros(3)
-    rays = []
+    directions, sizes_px = [], []
     for view in views:
         assert view.mask is not None
         rows, columns = np.nonzero(view.mask > 0.5)
@@ -241,15 +244,12 @@ def _first_guess(views: list[View]) -> tuple[Float64[np.ndarray, "3"], float]:
             )
         middle = np.array([(columns.min() + columns.max() + 1) / 2, (rows.min() + rows.max() + 1) / 2, 1.0])
         direction = view.camera.camera_from_world[:3, :3].T @ np.linalg.solve(view.camera.intrinsics, middle)
-        direction /= np.linalg.norm(direction)
-        across = np.eye(3) - np.outer(direction, direction)
-        system += across
-        right += across @ view.camera.position
-        size_px = float(np.hypot(columns + 0.5 - middle[0], rows + 0.5 - middle[1]).max())
-        rays.append((view.camera, size_px))
-    centre = np.linalg.lstsq(system, right, rcond=1e-9)[0]
-    radius = max(np.linalg.norm(centre - c.position) * size / c.fx_px for c, size in rays)
-    return centre, float(radius) * 1.5
+        directions.append(direction / np.linalg.norm(direction))
+        sizes_px.append(float(np.hypot(columns + 0.5 - middle[0], rows + 0.5 - middle[1]).max()))
+    cameras = [view.camera for view in views]
+    centre = _nearest_to_lines(np.array([camera.position for camera in cameras]), np.array(directions))
+    depths = [np.linalg.norm(centre - camera.position) / camera.fx_px for camera in cameras]
+    return centre, 1.5 * float(np.multiply(depths, sizes_px).max())
 
 
 def _masks_around(points: Float64[np.ndarray, "points 3"], views: list[View]) -> Int64[np.ndarray, "points"]:

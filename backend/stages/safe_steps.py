@@ -4,15 +4,23 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from ..errors import ErrorCode, ReconstructionError
+
 PATIENCE = 5
 """Steps that may be taken back before it is better to stop: the last ones were a sixteenth as long."""
 
 
 class SafeSteps:
-    """Steps of an optimiser; one whose loss or gradient is not finite is taken back to the last `keep`."""
+    """Steps of an optimiser; one whose loss or gradient is not finite is taken back to the last `keep`.
 
-    def __init__(self, optimiser: torch.optim.Optimizer) -> None:
+    With `longest`, longer gradients are cut to that length.
+    """
+
+    def __init__(self, optimiser: torch.optim.Optimizer, *, longest: float | None = None) -> None:
+        self.steps = 0
+        """How many were tried."""
         self.taken_back = 0
+        self._longest = longest
         self._optimiser = optimiser
         self._parameters: list[Tensor] = [p for group in optimiser.param_groups for p in group["params"]]
         self._rates: list[float] = [group["lr"] for group in optimiser.param_groups]
@@ -22,6 +30,22 @@ class SafeSteps:
     def hopeless(self) -> bool:
         """Whether so many steps were taken back that what they lead to is not to be trusted."""
         return self.taken_back >= PATIENCE
+
+    @property
+    def told(self) -> str:
+        """What the report says of them after their number; nothing where all went well."""
+        n = self.taken_back
+        return f", {n} of which {'was' if n == 1 else 'were'} not finite and taken back" if n else ""
+
+    def raise_if_nothing_was_learned(self) -> None:
+        """ReconstructionError(NO_SURFACE) where there is no hope, or no step was a good one."""
+        if self.hopeless or self.taken_back == self.steps:
+            raise ReconstructionError(
+                ErrorCode.NO_SURFACE,
+                "Nothing could be learned from the photographs: "
+                f"{self.taken_back} of {self.steps} steps gave numbers that are not finite.",
+                "Check that the photographs open in a viewer, or use another preset.",
+            )
 
     def keep(self) -> None:
         """Remember the parameters as they are."""
@@ -33,10 +57,13 @@ class SafeSteps:
         `length` is a share of the learning rates that the optimiser had at first; each step that was taken
         back has halved it.
         """
+        self.steps += 1
         for group, rate in zip(self._optimiser.param_groups, self._rates, strict=True):
             group["lr"] = rate * (length * 0.5**self.taken_back)
         self._optimiser.zero_grad(set_to_none=True)
         torch.autograd.backward(loss)
+        if self._longest is not None:
+            torch.nn.utils.clip_grad_norm_(self._parameters, self._longest)
         gradients = [p.grad.sum() for p in self._parameters if p.grad is not None]
         if bool(torch.stack([loss.detach(), *gradients]).isfinite().all()):
             self._optimiser.step()

@@ -10,7 +10,7 @@ from torch import Tensor
 from ..maths.evidence import half_cell_px, off_silhouette
 from ..maths.geometry import Pinhole, ray_directions
 from ..maths.grid import node_positions, read, spacing
-from ..maths.rays import first_crossing, points_along, sphere_entry
+from ..maths.rays import first_crossing, points_along, sphere_entry, sphere_span
 from .measurements import Measurements
 
 _AROUND = 1.75
@@ -139,8 +139,6 @@ def _meets_region(
     scene: Measurements, camera: Pinhole, directions: Float[Tensor, "rays 3"]
 ) -> Bool[Tensor, "rays"]:
     """Rays that go through the region's inner nine tenths."""
-    apart = scene.region_centre - camera.position
-    along = directions @ apart
-    closest = (apart - along[:, None] * directions).norm(dim=-1)
-    meets: Bool[Tensor, "rays"] = (closest < 0.9 * scene.region_radius) & (along > 0)
-    return meets
+    inner = (camera.position - scene.region_centre) / (0.9 * scene.region_radius)
+    entry, leave = sphere_span(inner.expand_as(directions), directions)
+    return leave > entry

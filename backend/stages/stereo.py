@@ -9,12 +9,11 @@ smaller sizes of the photographs measure.
 """
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 import torch
 import torch.nn.functional as F
-from jaxtyping import Bool, Float, Float32
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ..errors import ErrorCode, ReconstructionError
@@ -22,35 +21,11 @@ from ..maths.backdrop import find_backdrop
 from ..maths.geometry import pinhole_in_object, pixel_centres, sample_image, unproject
 from ..maths.inverse_depth import fit_planes, normals_from_planes
 from ..maths.texture import leverage
-from ..scene import Camera, Decision, Progress, Region, SurfacePoints, View, within
+from ..scene import DepthMap, Progress, Region, StereoResult, SurfacePoints, View, within
 from .depth_maps import Measured, depth_maps
 from .stereo_config import StereoConfig
 from .stereo_windows import neighbours, pyramid, sees_region
-
-
-@dataclass(frozen=True, kw_only=True)
-class DepthMap:
-    """What one photograph measured; full image size, object frame."""
-
-    depth: Float32[np.ndarray, "height width"]
-    """Along the camera's axis, object units; 0 where nothing was measured."""
-    confidence: Float32[np.ndarray, "height width"]
-    """0 to 1."""
-    empty: Bool[np.ndarray, "height width"] | None
-    """Where the photograph, if it has no mask, shows nothing but an even backdrop; None where it has none."""
-    subject: Bool[np.ndarray, "height width"] | None
-    """Where something surely stands before that backdrop."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class StereoResult:
-    """Points of the surface and the depth maps they come from, one per view."""
-
-    points: SurfacePoints
-    depth_maps: tuple[DepthMap, ...]
-    refined_cameras: tuple[Camera, ...] | None = None
-    """One per view; None where those that stereo was given are as good."""
-    decisions: tuple[Decision, ...] = ()
+from .strays import without_strays
 
 
 def match_views(
@@ -67,7 +42,7 @@ def match_views(
         points = _points(views, sizes, config)
     _check_enough(points, masked=any(view.mask is not None for view in views))
     full_size = (_full_size(view, maps, region, config) for view, maps in zip(views, sizes, strict=True))
-    return StereoResult(points=points, depth_maps=tuple(full_size))
+    return StereoResult(points=without_strays(points), depth_maps=tuple(full_size))
 
 
 def unmatched(views: tuple[View, ...]) -> StereoResult:
@@ -152,7 +127,7 @@ def _confidence(measured: Measured, config: StereoConfig) -> Float[Tensor, "heig
     halvings = math.log2(max(1.0, window.pixel_size / config.first_pixel_size))
     trust: float = config.trust_of_half_size**halvings
     sharp = (measured.sharpness / config.full_sharpness).clamp(0, 1).sqrt()
-    off_edge = measured.from_edge_px / (measured.from_edge_px + config.patch_radius)
+    off_edge = measured.from_edge_px / (measured.from_edge_px + config.edge_doubt * config.patch_radius)
     confidence: Float[Tensor, "height width"] = trust * agreement * certain * sharp * off_edge
     if config.free_leverage is not None:
         aside = leverage(window.grey, window.subject, config.patch_radius, window.noise)

@@ -15,12 +15,16 @@ class StereoConfig:
     """Pixels of the window in which all depths are tried."""
     num_planes: int = 192
     """Depths tried there, at most."""
+    semi_global: bool = True
+    """Whether depth is made smooth there; else each pixel chooses for itself."""
     patch_radius: int = 3
     """Half width of the patches, in pixels of the size at hand."""
     min_correlation: float = 0.3
     """Patches that agree less than this are not measurements."""
     full_sharpness: float = 0.03
     """Patches whose agreement drops by less than this one pixel off say less about depth."""
+    edge_doubt: float = 1.0
+    """Distance from an edge, in radii of a patch, at which a patch counts half; more than 0."""
     free_leverage: float | None = None
     """Patches whose texture lies further to one side say less about the depth of their middle; None: no less.
 

@@ -13,6 +13,7 @@ from ..maths.angles import angles_between
 from ..maths.backdrop import find_backdrop
 from ..maths.correlation import PatchStatistics, patch_statistics, without_local_mean
 from ..maths.geometry import Pinhole, pinhole_in_object, pixel_centres, unproject
+from ..maths.rays import sphere_span
 from ..scene import Region, View
 from .stereo_config import StereoConfig
 
@@ -91,11 +92,9 @@ def sees_region(camera: Pinhole) -> Bool[Tensor, "height width"]:
     """Pixels whose ray meets the unit sphere."""
     pixels = pixel_centres(camera.width, camera.height, camera.intrinsics.device)
     far = unproject(camera, pixels, torch.ones_like(pixels[..., 0])) - camera.position
-    direction = F.normalize(far, dim=-1)
-    along = -(direction @ camera.position)
-    closest = (camera.position + along[..., None] * direction).norm(dim=-1)
-    meets: Bool[Tensor, "height width"] = (closest < 1.0) & (along > 0)
-    return meets
+    directions = F.normalize(far, dim=-1).reshape(-1, 3)
+    entry, leave = sphere_span(camera.position.expand_as(directions), directions)
+    return (leave > entry).reshape(far.shape[:2])
 
 
 def _bounding_box(subject: Bool[Tensor, "height width"]) -> tuple[int, int, int, int]:

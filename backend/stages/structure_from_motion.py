@@ -306,6 +306,9 @@ def _placement(
     why = why_unplaced(database, [picture_name(index) for index in missing])
     photo_px_per_picture_px = [photos[p.index].image_srgb.shape[1] / p.lens.width for p in placed]
     names = {picture_name(index): photo.name for index, photo in enumerate(photos)}
+    evidence = camera_evidence(model, database, names, [i for _, i in images], photo_px_per_picture_px)
+    # As COLMAP's own mean, over points of the mean over who sees each; but photographs may differ in size.
+    mean_error_px = float((evidence.error_px.sum(axis=1) / visibility.sum(axis=1)).mean())
     return Placement(
         placed=placed,
         unplaced=tuple(
@@ -313,7 +316,8 @@ def _placement(
         ),
         sparse_positions=positions,
         sparse_visibility=visibility,
-        reprojection_error_px=model.compute_mean_reprojection_error() * photo_px_per_picture_px[0],
-        evidence=camera_evidence(model, database, names, [i for _, i in images], photo_px_per_picture_px),
+        reprojection_error_px=mean_error_px,
+        evidence=evidence,
+        estimated=True,
         decisions=decisions,
     )

@@ -6,27 +6,19 @@ the photographs (render_fit).
 """
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-import numpy as np
 import torch
-from jaxtyping import Float, Float32, Float64
-from torch import Tensor
 
-from ..errors import ErrorCode, ReconstructionError
 from ..maths.grid import refined, spacing
-from ..scene import Decision, Progress, Region, View, to_unit_sphere, within
+from ..scene import Decision, Progress, Region, StereoResult, View, within
 from .deadline import Clock, GridCost, deadline_after, finest_grid, predicted_s
 from .linear_fit import LinearConfig, fit_level, start
 from .measurements import Measurements, carried, measurements
-from .radiance_field import Radiance
 from .render_fit import RenderConfig, refine
-from .stereo import StereoResult
+from .surface import COARSEST, ShowSurface, Surface, show_nothing, tight_frame
 from .unseen_depth import depth_behind
-
-COARSEST = 48
-"""Nodes along each axis of the grid that finds the surface's extent."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,27 +36,6 @@ class TrainConfig:
     budget_s: float | None = None
     """Time for the whole stage; it ends earlier when all else here is done. None for no limit: then the
     result does not depend on the clock."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Surface:
-    """The field at its finest level."""
-
-    distance: Float32[np.ndarray, "nodes nodes nodes"]
-    """Signed, on nodes over the cube [-1, 1]^3 of the grid frame and in its units; > 0 outside."""
-    grid_from_world: Float64[np.ndarray, "4 4"]
-    """A similarity: the cube is laid tightly around the surface."""
-    radiance: Radiance | None = None
-    """The field to render from, where one was fitted."""
-    decisions: tuple[Decision, ...] = ()
-
-
-ShowSurface = Callable[[Surface], None]
-"""Called with the field as it is so far; must not change it."""
-
-
-def show_nothing(_surface: Surface) -> None:
-    """A callback for those who do not want to look at unfinished surfaces."""
 
 
 def fit_surface(
@@ -184,23 +155,3 @@ def _of_rendering(config: TrainConfig, rendered: int, taken_back: int) -> Decisi
 
 def _who_asked(config: TrainConfig, all_done: bool) -> str:
     return "the preset" if all_done or config.budget_s is None else "the time given"
-
-
-def tight_frame(distance: Float[Tensor, "nodes nodes nodes"], region: Region) -> Region:
-    """The cube around the inside of a coarse field, as the unit cube of a frame of its own.
-
-    Raises ReconstructionError(NO_SURFACE) if there is no inside.
-    """
-    cell = spacing(len(distance))
-    inside = torch.nonzero(distance < 0).float() * cell - 1
-    if not len(inside):
-        raise ReconstructionError(
-            ErrorCode.NO_SURFACE,
-            "No surface was found in the region.",
-            "Check that the photographs show the same thing, and that masks, if any, are white on it.",
-        )
-    low, high = inside.amin(dim=0), inside.amax(dim=0)
-    half = float((high - low).max()) / 2 + 2.5 * cell
-    centre = ((low + high) / 2).cpu().double().numpy()
-    frame_from_object = to_unit_sphere(centre, half)
-    return Region(object_from_world=frame_from_object @ region.object_from_world)

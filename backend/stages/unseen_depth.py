@@ -22,6 +22,8 @@ _MARGIN = 1.4
 
 def depth_behind(scene: Measurements, config: LinearConfig) -> tuple[float, Decision]:
     """Radius of the ball behind, in half widths of the subject, and what decided it."""
+    if config.ball is not None:
+        return config.ball, _decision(config.ball, "the preset")
     explained = explained_radius(scene)
     radius = _met_radius(scene, explained, config)
     angle_deg = widest_view_angle_deg(scene)
@@ -30,8 +32,12 @@ def depth_behind(scene: Measurements, config: LinearConfig) -> tuple[float, Deci
         because += f"; with the {explained:.2f} that measured points ask for, silhouettes were missed"
     elif not is_all_around(scene):
         because += "; so turn the normals of the measured points"
+    return radius, _decision(radius, because)
+
+
+def _decision(radius: float, because: str) -> Decision:
     choice = f"a ball of {radius:.2f} half widths of the subject behind what was measured"
-    return radius, Decision(what="depth of the unseen side", choice=choice, because=because)
+    return Decision(what="depth of the unseen side", choice=choice, because=because)
 
 
 def _met_radius(scene: Measurements, explained: float, config: LinearConfig) -> float:

@@ -18,6 +18,8 @@ _LARGEST_SHARE_LEFT = 0.9
 """Of the disagreement between photographs: where more is left, it was not exposure that made it."""
 _NEITHER_BLACK_NOR_WHITE = (0.04, 0.96)
 """sRGB values that tell of exposure."""
+_MOST_VERTICES = 20_000
+"""That exposures are found from, evenly over all: medians over more are the same."""
 _SURE_SHARE = 0.1
 """Weight of a vertex in a photograph from which on it tells of exposure: seen at 55 degrees, or not all on
 the subject."""
@@ -28,10 +30,13 @@ def colour_vertices(
     normals: Float64[np.ndarray, "vertices 3"],
     seen: Bool[np.ndarray, "vertices views"],
     views: tuple[View, ...],
+    *,
+    exposures_evened: bool = True,
 ) -> tuple[UInt8[np.ndarray, "vertices 3"], Decision]:
     """Mean of the photographs that see a vertex, those that see it frontally first; others from around.
 
-    Photographs of other exposure or white balance are brought to the mean of all first, if there are such.
+    Photographs of other exposure or white balance are brought to the mean of all first, if there are such and
+    it is asked for.
     """
     srgb = np.zeros((len(views), len(vertices), 3))
     share = np.zeros((len(views), len(vertices)))
@@ -43,7 +48,7 @@ def colour_vertices(
         # a pixel half off the subject has half the backdrop's colour: the fourth power leaves it out
         share[index, mine] = (np.clip(facing, 1e-3, 1) * sampled[:, 3]) ** 4
         srgb[index, mine] = sampled[:, :3]
-    exposures, decision = _exposures(srgb, share)
+    exposures, decision = _exposures(srgb, share) if exposures_evened else _not_asked(len(views))
     if exposures.any():
         srgb = srgb_from_linear(linear_from_srgb(srgb) * np.exp(-exposures)[:, None])
     weight = share.sum(axis=0)
@@ -57,11 +62,18 @@ def colour_vertices(
     return np.clip(colours * 255 + 0.5, 0, 255).astype(np.uint8), decision
 
 
+def _not_asked(num_views: int) -> tuple[Float64[np.ndarray, "views 3"], Decision]:
+    """As `_exposures` where the preset leaves it out."""
+    return np.zeros((num_views, 3)), Decision(what=_WHAT, choice="left as it is", because="the preset")
+
+
 def _exposures(
     srgb: Float64[np.ndarray, "views vertices 3"], share: Float64[np.ndarray, "views vertices"]
 ) -> tuple[Float64[np.ndarray, "views 3"], Decision]:
     """Natural logarithms to correct each photograph by, for each channel; zeros if it is not worth it."""
     black, white = _NEITHER_BLACK_NOR_WHITE
+    stride = max(1, -(-srgb.shape[1] // _MOST_VERTICES))
+    srgb, share = srgb[:, ::stride], share[:, ::stride]
     shown = (share > _SURE_SHARE) & ((srgb > black) & (srgb < white)).all(axis=2)
     log_light = np.log(linear_from_srgb(np.maximum(srgb, black)))
     channels = range(3)

@@ -73,7 +73,8 @@ class WireProcess:
         self._cancelled_s: float | None = None
         self._heard_hello = False
         self._ended = False
-        with log_path.open("wb") as log:
+        log_path.write_bytes(b"")
+        with log_path.open("ab") as log:  # to its end, so that the caller may add to it
             self._process = subprocess.Popen(
                 list(command),
                 stdin=subprocess.PIPE,
@@ -161,7 +162,8 @@ class WireProcess:
         elif waited_s > TERMINATE_AFTER_S:
             self._process.terminate()
         elif waited_s > INTERRUPT_AFTER_S:
-            self._process.send_signal(_INTERRUPT)
+            with suppress(OSError):  # Windows hands it on to programs of the same console alone
+                self._process.send_signal(_INTERRUPT)
 
     def _write(self, text: str) -> None:
         stdin: IO[bytes] | None = self._process.stdin
@@ -196,7 +198,7 @@ def describe_crash(exit_code: int, log_tail: str) -> Failed:
         reason = f"it was ended by {_WINDOWS_CODES[exit_code]}"
     else:
         reason = f"it ended with exit code {exit_code}"
-        remedy = "Check the backend with `python -m backend doctor`."
+        remedy = "Check the installation (doctor); where it is ready, please report this with the log."
     log = f"\n{log_tail}" if log_tail else ""
     return Failed(code=CRASHED, text=f"The backend ended without a result: {reason}.{log}", remedy=remedy)
 

@@ -18,7 +18,16 @@ PROTOCOL_VERSION = 1
 HEARTBEAT_S = 4.0
 """Longest silence of a healthy backend; the promise to the caller is 5 s."""
 
-PRESETS = ("fast", "balanced", "detailed", "nerf", "neus", "sparsecraft")
+PRESETS = (
+    "fast",
+    "balanced",
+    "detailed",
+    "nerf",
+    "neus",
+    "sparsecraft",
+    "neus-published",
+    "sparsecraft-published",
+)
 DEVICES = ("auto", "cpu", "cuda", "mps")
 UNTIL = ("cameras", "report")
 LARGEST_SEED = 2**31 - 1
@@ -58,6 +67,8 @@ class Job:
     """Time for fitting the surface; None for as long as the preset needs."""
     until: str = "report"
     """The last stage: "cameras" finds cameras and region and ends."""
+    keep_stages: bool = True
+    """Whether finished stages stay on the disk when all is done, for a later job in the same folder."""
 
 
 @dataclass(frozen=True, kw_only=True)

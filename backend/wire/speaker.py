@@ -1,5 +1,6 @@
 """The backend's side of the wire: messages out on a private descriptor, and signs of life between them."""
 
+import errno
 import os
 import threading
 import time
@@ -7,6 +8,9 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 from .protocol import HEARTBEAT_S, Heartbeat, Message, encode
+
+_CALLER_GONE = (errno.EPIPE, errno.EINVAL)
+"""What a pipe says whose reader has closed it: the second on Windows."""
 
 
 class Speaker:
@@ -42,7 +46,9 @@ class Speaker:
         try:
             while data:
                 data = data[os.write(self._descriptor, data) :]
-        except BrokenPipeError:
+        except OSError as error:
+            if error.errno not in _CALLER_GONE:
+                raise
             self._silent.set()
 
 

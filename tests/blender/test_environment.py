@@ -126,7 +126,7 @@ def test_an_environment_whose_python_was_removed_is_said(environment: Any, tmp_p
     (tmp_path / "bin").mkdir()
     (tmp_path / "bin" / "python").symlink_to(tmp_path / "gone")
     touch(tmp_path / ".fewview-environment")
-    with pytest.raises(environment.PythonMissing, match="install the environment again"):
+    with pytest.raises(environment.PythonMissing, match="press Set Up FewView again"):
         environment.find_python(variable="", preference="", managed=tmp_path)
 
 
@@ -196,8 +196,8 @@ def test_what_is_missing_is_named(environment: Any, tmp_path: Path) -> None:
 def test_without_a_backend_operators_say_what_to_do(preferences: Any, operators: Any) -> None:
     python, reason = operators.backend_python_or_reason(bpy.context)
     assert python is None
-    assert "Install the backend" in reason
-    with pytest.raises(RuntimeError, match="There is no backend yet"):
+    assert "Set Up FewView" in reason
+    with pytest.raises(RuntimeError, match="FewView is not set up"):
         bpy.ops.fewview.check_backend()
     preferences.backend_python = "/no/python"
     python, reason = operators.backend_python_or_reason(bpy.context)

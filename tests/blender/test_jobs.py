@@ -168,6 +168,51 @@ def test_a_result_that_cannot_be_used_is_a_failure(
     assert ends == ["cleaned"]
 
 
+@pytest.mark.parametrize("error", [KeyError("Scene"), ReferenceError("removed"), AssertionError("never")])
+def test_a_fault_ends_the_job_and_not_the_timer(jobs: ModuleType, tmp_path: Path, error: Exception) -> None:
+    def on_finished(_: object) -> Iterator[None]:
+        yield
+        raise error
+
+    command = say(tmp_path, HELLO, finished(tmp_path))
+    options = {"folder": tmp_path, "log_path": tmp_path / "log", "on_finished": on_finished}
+    jobs.start("Testing", command, **options, remedy="Look under the bed.")
+    tick_until(jobs, lambda: jobs.running() is None)
+    failure = jobs.ended().failure
+    assert failure.code == "internal"
+    assert type(error).__name__ in failure.text
+    assert failure.remedy == f"Look under the bed. The log says more: {tmp_path / 'log'}"
+    assert "in on_finished" in (tmp_path / "log").read_text(encoding="utf-8")  # the trace
+    jobs.start("Testing", command, **options)  # nothing is "still running"
+
+
+@pytest.mark.parametrize("preview", [True, False])
+def test_a_fault_beside_the_result_does_not_lose_it(jobs: ModuleType, tmp_path: Path, preview: bool) -> None:
+    def fails(*_: object) -> Iterator[None]:
+        raise KeyError("gone")
+
+    shown = {"type": "preview", "path": str(tmp_path / "preview.ply")}
+    then = f"time.sleep(0.3); print({json.dumps(json.dumps(finished(tmp_path)))}, flush=True)"
+    end = run(
+        jobs,
+        tmp_path,
+        say(tmp_path, HELLO, shown, then=then),
+        **{"on_preview" if preview else "on_end": fails},
+    )
+    assert end.failure is None
+    assert [text for text in end.warnings if "KeyError" in text]
+    assert "gone" in (tmp_path / "log").read_text(encoding="utf-8")
+
+
+def test_a_fault_while_the_program_speaks(
+    jobs: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(jobs, "_take_in", lambda *_: {}["missing"])
+    end = run(jobs, tmp_path, say(tmp_path, HELLO, then="sys.stdin.readline()"))
+    assert end.failure.code == "internal"
+    assert jobs.running() is None
+
+
 def test_one_at_a_time(jobs: ModuleType, tmp_path: Path) -> None:
     command = say(tmp_path, HELLO, then="time.sleep(60)")
     options = {"folder": tmp_path, "log_path": tmp_path / "log", "on_finished": lambda _: iter(())}
@@ -237,14 +282,15 @@ def test_another_file_keeps_the_job_off_the_scene(jobs: ModuleType, tmp_path: Pa
     command = say(
         tmp_path, HELLO, then=f"sys.stdin.readline(); print({json.dumps(json.dumps(finished(tmp_path)))})"
     )
-    jobs.start("Testing", command, folder=tmp_path, log_path=tmp_path / "log", on_finished=on_finished)
+    options = {"folder": tmp_path, "log_path": tmp_path / "log", "on_finished": on_finished}
+    jobs.start("Testing", command, **options, remedy="It lies in the drawer.")
     bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
     assert jobs.running() is not None
     jobs.cancel()  # here it makes the program finish
     tick_until(jobs, lambda: jobs.ended() is not None)
     assert jobs.ended().failure is None
     assert touched == []
-    assert "Another file" in jobs.ended().warnings[0]
+    assert jobs.ended().warnings == ("Another file was opened meanwhile. It lies in the drawer.",)
 
 
 def test_switching_the_add_on_off_ends_the_job(addon: ModuleType, jobs: ModuleType, tmp_path: Path) -> None:

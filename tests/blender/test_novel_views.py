@@ -2,6 +2,7 @@
 
 import json
 import os
+import subprocess
 import sys
 import time
 from collections.abc import Callable
@@ -385,3 +386,95 @@ def side_of(columns: np.ndarray, rows: np.ndarray, start: np.ndarray, end: np.nd
     """Signed distance from the line through two points, in pixels."""
     (x, y), (dx, dy) = start, (end - start) / np.linalg.norm(end - start)
     return (columns - x) * dy - (rows - y) * dx
+
+
+MAKE_FIELD = """
+import sys
+import numpy as np
+import torch
+from pathlib import Path
+from backend.records import save_record
+from backend.scene import Region
+from backend.stages.radiance_field import Radiance, RadianceField, RadianceShape, kept
+
+shape = RadianceShape(width=16, layers=2, proposal_width=8, proposal_intervals=8, intervals=6)
+field = RadianceField(shape, torch.Generator().manual_seed(0))
+region = Region(object_from_world=np.load(sys.argv[1]))
+save_record(Path(sys.argv[2]), kept(field, region, torch.tensor([0.0, 1.0, 0.0])), Radiance)
+"""
+"""A field that has learned nothing, before green."""
+ASK_FIELD = """
+import sys
+import numpy as np
+import torch
+from pathlib import Path
+from backend.maths.radiance import composite
+from backend.records import load_record
+from backend.stages.radiance_field import Radiance, restored, sample_rays
+
+radiance = load_record(Path(sys.argv[2]), Radiance)
+rays = [torch.from_numpy(part).float() for part in np.load(sys.argv[1])]
+with torch.no_grad():
+    samples = sample_rays(restored(radiance, torch.device("cpu")), *rays, None)
+    behind = torch.from_numpy(radiance.background_srgb)[None]
+    np.save(sys.argv[3], composite(samples.log_pass, samples.colour, behind).numpy())
+"""
+"""The colours of rays, which are given in the region's frame."""
+
+
+def with_torch(program: str, *words: Path) -> None:
+    """Run in the Python of the backend."""
+    command = [os.environ["FEWVIEW_PYTHON"], "-c", program, *map(str, words)]
+    root = Path(__file__).resolve().parents[2]
+    environment = {key: value for key, value in os.environ.items() if not key.startswith("PYTHON")}
+    subprocess.run(command, cwd=root, check=True, timeout=200, env=environment)
+
+
+def blender_rays(made: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Origin, and (height, width, 3) directions, of a ray through each pixel's middle, as Blender draws."""
+    render = bpy.context.scene.render
+    width, height = (
+        side * render.resolution_percentage // 100 for side in (render.resolution_x, render.resolution_y)
+    )
+    frame = np.array(made.data.view_frame(scene=bpy.context.scene))  # right above, right below, left below
+    across = (frame[1] - frame[2]) * ((np.arange(width) + 0.5) / width)[:, None]
+    down = (frame[1] - frame[0]) * ((np.arange(height) + 0.5) / height)[:, None, None]
+    turn = np.array(made.matrix_world.to_quaternion().to_matrix())
+    return np.array(made.matrix_world.translation), (frame[3] + across + down) @ turn.T
+
+
+@pytest.mark.slow
+@pytest.mark.skipif("FEWVIEW_PYTHON" not in os.environ, reason="FEWVIEW_PYTHON names no Python with it")
+def test_a_radiance_field_is_seen_as_from_blenders_cameras(result: Any, tmp_path: Path) -> None:
+    """Every pixel is what the field says of the ray that Blender sends through it."""
+    render = bpy.context.scene.render
+    render.resolution_x, render.resolution_y, render.resolution_percentage = 96, 64, 50
+    render.pixel_aspect_x, render.pixel_aspect_y = 1.25, 1.0
+    move_both(result)
+    region_from_job = np.diag([0.8, 0.8, 0.8, 1.0])
+    region_from_job[:3, 3] = (-0.3, 0.2, 0.1)
+    np.save(tmp_path / "region.npy", region_from_job)
+    field = job_of(result) / "result" / "radiance.npz"
+    with_torch(MAKE_FIELD, tmp_path / "region.npy", field)
+    made = camera("Camera", world_points(result), (1, -2, 0.5), shift_x=0.1)
+    assert bpy.ops.fewview.render_novel_views(device="cpu") == {"FINISHED"}
+
+    corners_in_world, corners_in_job = (
+        np.append(corners, np.ones((4, 1)), axis=1).T for corners in (world_points(result), CORNERS)
+    )
+    region_from_world = region_from_job @ corners_in_job @ np.linalg.inv(corners_in_world)
+    position, directions = blender_rays(made)
+    origin = region_from_world[:3, :3] @ position + region_from_world[:3, 3]
+    towards = directions.reshape(-1, 3) @ region_from_world[:3, :3].T
+    towards /= np.linalg.norm(towards, axis=1, keepdims=True)
+    np.save(tmp_path / "rays.npy", np.stack([np.broadcast_to(origin, towards.shape), towards]))
+    with_torch(ASK_FIELD, tmp_path / "rays.npy", field, tmp_path / "colours.npy")
+    expected = 255 * np.load(tmp_path / "colours.npy").reshape(directions.shape)
+    image = bpy.data.images["Camera.png"]
+    width, height = image.size
+    assert (height, width) == directions.shape[:2] == (32, 48)
+    found = 255 * np.array(image.pixels, np.float32).reshape(height, width, 4)[::-1, :, :3]
+    outside = (expected == (0, 255, 0)).all(axis=-1)
+    assert 0.2 < outside.mean() < 0.9
+    np.testing.assert_allclose(found, expected, atol=1.5)
+    assert np.abs(found[:, ::-1] - expected).max() > 20, "a mirrored picture would be noticed"

@@ -106,7 +106,7 @@ class Situation:
 
 ON_RESULT = ((Situation.nothing, "Reconstruct first"), (Situation.editing, "Object Mode"))
 NEEDS_BACKEND = (
-    (Situation.no_backend, "Install the backend"),
+    (Situation.no_backend, "press Set Up FewView"),
     (Situation.wrong_backend, "is not there"),
 )
 
@@ -171,7 +171,7 @@ OPERATORS = {
     "show_colour": Expected(undo=True, grey=(*ON_RESULT, (Situation.result, "no colors"))),
     "show_error": Expected(undo=True, grey=(*ON_RESULT, (Situation.result, "Measure the error first"))),
     "show_log": Expected(undo=True, grey=((Situation.nothing, "No job has run"),)),
-    "show_photograph": Expected(undo=True, grey=((Situation.nothing, "Find the cameras first"),)),
+    "show_photograph": Expected(undo=True, grey=((Situation.nothing, "Estimate the cameras first"),)),
     "show_support": Expected(undo=True, grey=(*ON_RESULT, (Situation.result, "support"))),
 }
 GREY = [
@@ -400,6 +400,20 @@ def test_a_full_list_says_so(
     assert any(kind == {"WARNING"} and "full" in text for kind, text in said)
 
 
+def test_pictures_that_cannot_be_read_are_named(
+    settings: Any, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    add_pictures(tmp_path, "a.png", "b.png")
+    (tmp_path / "phone.HEIC").write_bytes(b"")
+    assert bpy.ops.fewview.add_images(directory=str(tmp_path)) == {"FINISHED"}
+    assert names_in(settings) == ["a.png", "b.png"]
+    assert "phone.HEIC" in capfd.readouterr().out
+    (tmp_path / "a.png").unlink()
+    (tmp_path / "b.png").unlink()
+    with pytest.raises(RuntimeError, match=r"phone\.HEIC"):
+        bpy.ops.fewview.add_images(directory=str(tmp_path))
+
+
 def test_photographs_are_removed_one_by_one_and_all(settings: Any, tmp_path: Path) -> None:
     add_pictures(tmp_path, "a.png", "b.png", "c.png")
     bpy.ops.fewview.add_images(directory=str(tmp_path))
@@ -440,7 +454,7 @@ def test_pictures_are_dropped_on_our_tab_alone(
     assert handler.poll_drop(context) == taken
     assert handler.bl_import_operator == "fewview.add_images"
     operators_module = importlib.import_module(handler.__module__)
-    assert set(handler.bl_file_extensions.split(";")) == set(operators_module.EXTENSIONS)
+    assert set(handler.bl_file_extensions.split(";")) == set(operators_module.SUFFIXES)
 
 
 def test_the_log_is_no_text_of_the_users(situation: Situation, tmp_path: Path) -> None:

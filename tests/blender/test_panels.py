@@ -107,6 +107,7 @@ class Sidebar:
             on_preview=None,
             on_end=None,
             about_scene=True,
+            remedy="Start it again.",
         )
         for name, value in known.items():
             setattr(job, name, value)
@@ -242,7 +243,12 @@ def test_without_a_backend(sidebar: Sidebar, online: bool) -> None:
     sidebar.backend("none")
     layout = sidebar.draw_all()["FEWVIEW_PT_main"]
     assert layout.main() == ["fewview.install_backend"]
-    assert "Not installed" in layout.texts()
+    assert "Not set up yet" in layout.texts()
+    buttons = [drawn for drawn in layout.drawn if drawn.kind == "operator" and drawn.text]
+    for drawn in buttons:  # one name each
+        category, name = drawn.what.split(".")
+        if category == "fewview":
+            assert drawn.text == getattr(bpy.ops.fewview, name).get_rna_type().name
     assert ("screen.userpref_show" in layout.operators()) == (not online)
     assert {"fewview.check_backend", "fewview.copy_install_lines"} <= set(layout.operators())
     assert not bpy.ops.fewview.reconstruct.poll()
@@ -525,7 +531,7 @@ def test_a_job_that_failed(sidebar: Sidebar) -> None:
 def test_a_job_that_was_cancelled(sidebar: Sidebar) -> None:
     sidebar.ended(failure=sidebar.failure("cancelled", "Stopped."))
     layout = sidebar.draw_all()["FEWVIEW_PT_main"]
-    assert layout.texts() == ["Reconstructing was cancelled"]
+    assert layout.texts() == ["Reconstructing was cancelled", "Add light."]  # what to do next
     assert set(layout.operators()) == {"fewview.dismiss"}
 
 

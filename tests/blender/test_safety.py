@@ -245,7 +245,7 @@ def test_opening_another_file_while_it_runs(rehearsal: Rehearsal) -> None:
     assert rehearsal.jobs.running() is not None
     end = rehearsal.to_end()
     assert end.failure is None
-    assert any("Import Past Job" in text for text in end.warnings)
+    assert any("Past Jobs" in text for text in end.warnings)
     assert not bpy.data.objects
     assert bpy.ops.fewview.import_result(folder=str(folder)) == {"FINISHED"}
     assert_one_result(folder)
@@ -270,6 +270,10 @@ def test_opening_another_file_amid_the_import(
     assert not bpy.data.objects
 
 
+def previews() -> list[Any]:
+    return [made for made in bpy.context.scene.objects if made.get(ROLE) == "preview"]
+
+
 @pytest.mark.parametrize("how", ["removed", "deleted", "hidden", "emptied"])
 def test_the_preview_is_taken_away(rehearsal: Rehearsal, how: str) -> None:
     folder = rehearsal.start(seconds=2)
@@ -283,9 +287,7 @@ def test_the_preview_is_taken_away(rehearsal: Rehearsal, how: str) -> None:
             preview.hide_set(True)
         case "emptied":
             bpy.data.meshes.remove(preview.data)  # takes the object with it
-    rehearsal.tick_until(lambda: rehearsal.jobs.running().stage == "mesh")
-    (shown,) = [made for made in bpy.context.scene.objects if made.get(ROLE) == "preview"]
-    assert len(shown.data.polygons) == 4  # the next one came
+    rehearsal.tick_until(lambda: [len(made.data.polygons) for made in previews()] == [4])  # the next one came
     assert rehearsal.to_end().failure is None
     assert_one_result(folder)
 

@@ -33,7 +33,8 @@ from backend.scene import (
     to_unit_sphere,
 )
 from backend.stages.region import RegionConfig
-from backend.stages.train import ShowSurface, Surface
+from backend.stages.surface import ShowSurface, Surface
+from backend.wire.photographs import photographs_in
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -82,7 +83,9 @@ def load_photos(
     work("photos", progress)
     image = np.zeros((4, 6, 3), np.float32)
     sizes: dict[str, Any] = {"original_width": 6, "original_height": 4, "focal_px": None}
-    paths = sorted(sources[0].iterdir())
+    paths = sorted(
+        path for source in sources for path in (photographs_in(source) if source.is_dir() else [source])
+    )
     return tuple(Photo(name=path.name, path=path, image_srgb=image, mask=None, **sizes) for path in paths)
 
 

@@ -70,6 +70,14 @@ class Case:
         pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
         return subprocess.Popen(command, env=self.environment, text=True, cwd=self.folder, **pipes, **options)
 
+    def converse(self, *command: str) -> int:
+        """The exit code of a run on the wire, whose caller waits for its end."""
+        pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.DEVNULL}
+        with subprocess.Popen(command, env=self.environment, cwd=self.folder, **pipes) as process:
+            assert process.stdout is not None
+            process.stdout.read()  # while stdin is open
+            return process.wait()
+
     def done(self) -> list[str]:
         """Stages computed since the last call."""
         path = self.folder / "done"
@@ -272,6 +280,26 @@ def test_a_run_leaves_its_results_and_the_next_one_resumes(case: Case) -> None:
     assert (case.output / "mesh.ply").read_bytes() == results["mesh.ply"]
 
 
+def test_pictures_that_cannot_be_read_are_told(case: Case) -> None:
+    (case.photos / "phone.HEIC").write_bytes(b"")
+    result = case.run()
+    assert "phone.HEIC" in result.stderr
+    warnings = json.loads((case.output / "report.json").read_text())["warnings"]
+    assert any("phone.HEIC" in text for text in warnings)
+
+
+def test_a_job_that_keeps_no_stages_leaves_results_alone(case: Case) -> None:
+    job = str(case.write_job(keep_stages=False))
+    assert case.converse(*case.command("internal", "mesh"), job) == 1
+    kept = {path.stem for path in (case.output / ".fewview").glob("*.npz")}
+    assert kept == set(STAGES) - {"mesh"}
+    assert case.done() == [*STAGES]
+    assert case.converse(*case.command(), job) == 0
+    assert case.done() == ["mesh"]  # it went on
+    assert set(case.results()) == RESULTS
+    assert {path.name for path in (case.output / ".fewview").iterdir()} == {"format.json", "lock"}
+
+
 def test_what_depends_on_a_change_is_redone_and_nothing_else(case: Case) -> None:
     case.run()
     mesh = (case.output / "mesh.ply").read_bytes()
@@ -343,6 +371,46 @@ def test_someone_elses_folder_is_not_touched(case: Case) -> None:
     assert result.returncode == 2
     assert "did not make" in result.stderr
     assert {path: path.stat().st_mtime_ns for path in [case.photos, *case.photos.iterdir()]} == before
+
+
+def test_another_shoot_does_not_replace_a_finished_result(case: Case) -> None:
+    case.run()
+    before = case.results()
+    for index in range(3):
+        Image.fromarray(np.full((4, 6, 3), 200 + index, np.uint8)).save(case.photos / f"{index}.png")
+    again = case.run()
+    assert again.returncode == 2
+    assert "other photographs" in again.stderr
+    assert "new or empty output folder" in again.stderr
+    assert {**case.results(), "log.txt": b""} == {**before, "log.txt": b""}
+
+
+def test_pages_and_meshes_are_of_the_same_cameras(case: Case) -> None:
+    """What the other command left and does not fit is removed where it is soon made again, else protected."""
+    converse(case, until="cameras")
+    converse(case)
+    assert set(case.results()) == RESULTS | CAMERA_PAGES
+    refused = converse(case, until="cameras", seed=5)[-1]
+    assert isinstance(refused, Failed)
+    assert refused.code == "output_unusable"
+    assert set(case.results()) == RESULTS | CAMERA_PAGES
+    assert isinstance(converse(case, seed=5)[-1], Finished)
+    assert set(case.results()) == RESULTS
+    assert isinstance(converse(case, until="cameras", seed=5)[-1], Finished)
+    assert set(case.results()) == RESULTS | CAMERA_PAGES
+
+
+def test_a_folder_whose_name_stdout_cannot_say_gets_its_results(case: Case) -> None:
+    """A pipe on Windows takes the letters of one language; here those of ASCII alone."""
+    output = case.folder / "Größe"
+    command = [*case.command(), str(case.photos), "--output", str(output), "--device", "cpu"]
+    environment = {**case.environment, "PYTHONIOENCODING": "ascii"}
+    result = subprocess.run(
+        command, env=environment, capture_output=True, text=True, timeout=60, cwd=case.folder, check=False
+    )
+    assert result.returncode == 0, result.stderr
+    assert r"Gr\xf6\xdfe" in result.stdout
+    assert (output / "mesh.ply").is_file()
 
 
 def test_a_missing_truth_is_told_before_the_work(case: Case) -> None:

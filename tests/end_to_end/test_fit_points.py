@@ -11,10 +11,11 @@ import numpy as np
 import pytest
 import trimesh
 
-from backend.commands.fit_points import POINT_METHODS
 from backend.mesh_files import read_mesh
+from backend.point_methods import PointMethod
 from backend.stages.point_network import METHODS
 from backend.wire.protocol import Failed, Finished, Hello, Stage, decode
+from backend.workspace import open_workspace
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -31,9 +32,11 @@ def finished(*arguments: object) -> subprocess.CompletedProcess[str]:
 
 @pytest.fixture
 def cloud(tmp_path: Path) -> Path:
+    """Of a sphere, with two that are no numbers."""
     points = np.random.default_rng(0).normal(size=(400, 3))
+    points /= np.linalg.norm(points, axis=1, keepdims=True)
     path = tmp_path / "cloud.xyz"
-    np.savetxt(path, points / np.linalg.norm(points, axis=1, keepdims=True))
+    np.savetxt(path, [[np.nan] * 3, *points, [0, np.inf, 0]])
     return path
 
 
@@ -49,6 +52,10 @@ def test_a_cloud_becomes_a_mesh_with_its_numbers(cloud: Path, tmp_path: Path) ->
     assert report["watertight"]
     assert report["num_faces"] == len(read_mesh(output / "mesh.ply").faces)
     assert report["error"]["chamfer_percent"] < 0.5
+    assert report["num_points"] == 400
+    told = {decision["what"]: decision["choice"] for decision in report["decisions"]}
+    assert told["points that are not finite"] == "2 of 402 left out"
+    assert told["the sides' network"] == "300 steps"
     refused = finished(cloud, "--output", tmp_path)
     assert refused.returncode == 2
     assert "FewView did not make" in refused.stderr
@@ -84,6 +91,16 @@ def test_a_cloud_without_points_is_refused_and_leaves_nothing(tmp_path: Path) ->
     assert not (tmp_path / "out").exists()
 
 
+def test_a_reconstruction_is_not_replaced(cloud: Path, tmp_path: Path) -> None:
+    with open_workspace(tmp_path / "out") as workspace:
+        workspace.claim("photographs", ["1"])
+        workspace.write_results({"mesh.ply": lambda path: path.write_text("a mesh")})
+    run = finished(cloud, "--output", tmp_path / "out")
+    assert run.returncode == 2
+    assert "a reconstruction from photographs" in run.stderr
+    assert (tmp_path / "out/mesh.ply").read_text() == "a mesh"
+
+
 @pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX")
 def test_ctrl_c_leaves_nothing(cloud: Path, tmp_path: Path) -> None:
@@ -101,5 +118,6 @@ def test_ctrl_c_leaves_nothing(cloud: Path, tmp_path: Path) -> None:
     assert not (tmp_path / "out").exists()
 
 
-def test_the_command_offers_the_methods_there_are() -> None:
-    assert set(POINT_METHODS) == {"linear", *METHODS}
+def test_the_methods_offered_are_those_there_are() -> None:
+    """Each is the grid's or has a network."""
+    assert set(PointMethod) == {PointMethod.LINEAR, *METHODS}

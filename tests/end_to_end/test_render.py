@@ -25,6 +25,7 @@ from backend.stages.radiance_image import radiance_image
 from backend.wire.client import clean_environment
 from backend.wire.protocol import Finished, Hello, Stage, decode
 from backend.wire.protocol import Progress as WireProgress
+from backend.workspace import open_workspace
 from tests.synthetic_scene import (
     Scene,
     photographed,
@@ -158,6 +159,9 @@ def test_a_job_s_own_folder_gets_no_pictures(folder: Path) -> None:
     error = refusal(folder, output="nerf")
     assert error.code is ErrorCode.OUTPUT_UNUSABLE
     assert "results of a reconstruction" in error.text
+    with open_workspace(folder / "points") as workspace:
+        workspace.claim("points")
+    assert "fitted to points" in refusal(folder, output="points").text
 
 
 def test_what_is_no_job_is_told(folder: Path) -> None:

@@ -1,6 +1,8 @@
 """Distances on a grid where it is delicate: at borders of cells and of the box, and without a gradient."""
 
+import math
 from collections.abc import Callable
+from dataclasses import replace
 from functools import cache
 
 import pytest
@@ -9,6 +11,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from backend.maths import losses
+from backend.maths.gradients import central_gradient
 from backend.maths.grid import (
     interpolate,
     laplacian,
@@ -18,8 +21,9 @@ from backend.maths.grid import (
     spacing,
     value_and_gradient,
 )
+from backend.maths.hash_grid import corner_rows, encode, table_rows
 from backend.maths.rays import sphere_entry
-from tests.stability.sweep import Sweep, check, gradient, largest
+from tests.stability.sweep import Errors, Sweep, check, gradient, largest
 
 CPU = torch.device("cpu")
 NODES = (2, 3, 47, 96, 192)
@@ -60,6 +64,142 @@ def border_error(value: Callable[[Tensor, int], Tensor]) -> float:
     """Largest, in units of the box's half side."""
     cases = [(border_points(nodes), nodes) for nodes in NODES]
     return max(largest(value(points, n), interpolated(points.double(), n)) for points, n in cases)
+
+
+# gradients at borders
+
+Slope = Callable[[Tensor, int], Tensor]
+"""From places and a number of nodes to the gradient of the ball's interpolated distance."""
+
+
+def slope_of_a_cell(points: Tensor, nodes: int) -> Tensor:
+    return value_and_gradient(ball(nodes).to(points.dtype), locate(points, nodes))[1]
+
+
+def slope_across_the_border(points: Tensor, nodes: int) -> Tensor:
+    """A central difference that is narrow beside a cell."""
+    step = 1e-2 * spacing(nodes)
+    taps = step * torch.eye(3, dtype=points.dtype)
+    ahead, behind = (interpolated((points[:, None] + sign * taps).reshape(-1, 3), nodes) for sign in (1, -1))
+    return ((ahead - behind) / (2 * step)).reshape(-1, 3)
+
+
+def border_slope_error(slope: Slope) -> Errors:
+    """Difference from the gradient in that cell around each place which agrees best."""
+
+    def error(nodes: int) -> float:
+        points = border_points(nodes)
+        found, inner = slope(points, nodes), points.double().clamp(-1, 1)
+        step = 1e-3 * spacing(nodes)
+        corners = torch.cartesian_prod(*[torch.tensor([-step, step], dtype=torch.float64)] * 3)
+        apart = [(found - slope_of_a_cell(inner + corner, nodes)).abs().amax(dim=-1) for corner in corners]
+        return float(torch.stack(apart).amin(dim=0).max())
+
+    return {f"{nodes} nodes": error(nodes) for nodes in NODES}
+
+
+def border_eikonal_error(slope: Slope) -> Errors:
+    """Of the ball's eikonal loss at borders of cells and of the box, which is nearly 0.
+
+    A cell's gradient is off by the square of its share of the radius.
+    """
+    errors = {}
+    for nodes in NODES[2:]:
+        points = border_points(nodes)[:1200]  # the others lie beyond the box
+        far = points.norm(dim=-1) > 0.3
+        errors[f"{nodes} nodes"] = float(losses.eikonal(slope(points[far], nodes)))
+    return errors
+
+
+# a network's gradient by differences
+
+
+def slanted(points: Tensor) -> Tensor:
+    """A plane's distance: differences of it are its normal at any step."""
+    normal = torch.tensor([0.48, -0.6, 0.64], dtype=torch.float64).to(points.dtype)
+    return points @ normal + 0.3
+
+
+Difference = Callable[[Tensor, float], Tensor]
+"""From places and a step to the plane's gradient."""
+
+
+def over_twice_the_step(points: Tensor, step: float) -> Tensor:
+    """Taps are moved to the box's side, and the step is taken for what it was."""
+    taps = step * torch.eye(3)
+    ahead, behind = (slanted((points[:, None] + sign * taps).clamp(-1, 1)) for sign in (1, -1))
+    return (ahead - behind) / (2 * step)
+
+
+def difference_error(differences: Difference) -> Errors:
+    """With steps of 1/64, 1/160 and 1/512, as wide as a cell of the hash grid's last level."""
+    generator = torch.Generator().manual_seed(0)
+    inner = 1.9 * torch.rand((1000, 3), generator=generator) - 0.95
+    sides = inner.clone()
+    sides[torch.arange(1000), torch.arange(1000) % 3] = inner[:, 0].sign()
+    exact = slanted(torch.eye(3).double()) - slanted(torch.zeros(1, 3).double())
+    steps = (1 / 64, 1 / 160, 1 / 512)
+    return {
+        name: max(largest(differences(points, step), exact.expand(1000, 3)) for step in steps)
+        for name, points in (("inside", inner), ("sides", sides))
+    }
+
+
+# the hash grid
+
+CELLS = (4, 16, 160)
+FEATURES = 2
+
+
+def tables() -> list[Tensor]:
+    """Of three levels, the last one hashed."""
+    generator = torch.Generator().manual_seed(0)
+    return [
+        torch.rand((table_rows(cells, 2**17), FEATURES), generator=generator, dtype=torch.float64)
+        for cells in CELLS
+    ]
+
+
+def hashed(points: Tensor) -> Tensor:
+    return encode([table.to(points.dtype) for table in tables()], CELLS, points, len(CELLS))
+
+
+def one_cell_beyond(points: Tensor) -> Tensor:
+    """floor(x) as it is: on the far side of the box the cell is the one after the last."""
+    found = []
+    for table, cells in zip(tables(), CELLS, strict=True):
+        scaled = (points.clamp(-1, 1) + 1) * (0.5 * cells)
+        low = scaled.floor()
+        x, y, z = torch.stack([1 - scaled + low, scaled - low], dim=1).unbind(-1)
+        weight = x[:, :, None, None] * y[:, None, :, None] * z[:, None, None, :]
+        rows = corner_rows(low.long(), cells, len(table)).clamp(max=len(table) - 1)
+        found.append((weight.flatten(1)[..., None] * table.to(points.dtype)[rows]).sum(dim=1))
+    return torch.cat(found, dim=-1)
+
+
+def hash_value_error(encoded: Callable[[Tensor], Tensor]) -> float:
+    """On nodes, a digit beside them, on and beyond the box; features from 0 to 1."""
+    return max(
+        largest(encoded(points), hashed(points.double()))
+        for points in (border_points(cells + 1) for cells in CELLS)
+    )
+
+
+def hash_slope_error(encoded: Callable[[Tensor], Tensor]) -> float:
+    """Of the sum of features by the place, on nodes and on the box's sides: that of a cell beside it."""
+    worst = 0.0
+    for cells in CELLS:
+        points = border_points(cells + 1)[:1200].clamp(-1, 1)
+        found = gradient(encoded, points)
+        step = 1e-5
+        corners = torch.cartesian_prod(*[torch.tensor([-step, step], dtype=torch.float64)] * 3)
+        # a place must not be moved over the box's side: there the features are constant
+        beside = [(points.double() + corner).clamp(-1 + step, 1 - step) for corner in corners]
+        apart = [(found - gradient(hashed, place)).abs().amax(dim=-1) for place in beside]
+        if not found.isfinite().all():
+            return math.inf
+        worst = max(worst, float(torch.stack(apart).amin(dim=0).max()) / max(CELLS))
+    return worst
 
 
 # lengths of gradients
@@ -103,18 +243,31 @@ def pulled(distance: Tensor, g: Tensor, p_minus_q: Tensor) -> Tensor:
 
 
 def newton_pulled(distance: Tensor, g: Tensor, p_minus_q: Tensor) -> Tensor:
-    """The same by a Newton step."""
+    """The same by a Newton step: also the published program of SparseCraft's Taylor residual."""
     return (p_minus_q + distance[:, None] * g / g.square().sum(dim=-1, keepdim=True)).norm(dim=-1)
 
 
-def taylor_error(residual: Callable[[Tensor, Tensor, Tensor], Tensor]) -> float:
-    """Of the residual and of its derivative by the gradient, in shares of 1 + |g|."""
+def taylor_error(residual: Callable[[Tensor, Tensor, Tensor], Tensor]) -> Errors:
+    """Of the residual and of its derivative by the gradient, against their own values in float64.
+
+    In shares of 1 + |g| + their own size.
+    """
     distance, g, p_minus_q = taylor_cases()
-    size = 1 + g.double().norm(dim=-1)
-    exact = distance.double() + (g.double() * p_minus_q.double()).sum(dim=-1)
-    value = residual(distance, g, p_minus_q)
-    slope = gradient(lambda x: residual(distance, x, p_minus_q), g)
-    return max(largest(value, exact, size), largest(slope, p_minus_q))
+
+    def slope(g: Tensor) -> Tensor:
+        return gradient(lambda x: residual(distance.to(g.dtype), x, p_minus_q.to(g.dtype)), g)
+
+    value, exact = residual(distance, g, p_minus_q), residual(*(x.double() for x in taylor_cases()))
+    length = g.double().norm(dim=-1)
+    size, by_g, exact_by_g = 1 + length, slope(g), slope(g.double())
+    errors = {}
+    for name, least, below in (("|g| = 0", 0, 1e-46), ("faint", 1e-46, 1e-11), ("|g| >= 1e-10", 1e-11, 1e9)):
+        here = (length >= least) & (length < below)
+        errors[name] = max(
+            largest(value[here], exact[here], size[here] + exact[here].abs()),
+            largest(by_g[here], exact_by_g[here], 1 + exact_by_g[here].norm(dim=-1, keepdim=True)),
+        )
+    return errors
 
 
 def pull_error(pull: Callable[[Tensor, Tensor, Tensor], Tensor], least_slope: float, power: int) -> float:
@@ -243,6 +396,50 @@ SWEEPS = (
         tolerance=1e-6,
     ),
     Sweep(
+        what="gradient at borders of cells and of the box, against that of a cell beside; 2 to 192 nodes",
+        usual_formula="a central difference over a fiftieth of a cell",
+        usual=lambda: border_slope_error(slope_across_the_border),
+        ours=lambda: border_slope_error(slope_of_a_cell),
+        tolerance=5e-3,  # beside the border by a thousandth of a cell
+        usual_holds=("2 nodes",),  # one cell, in which the ball's distance is constant
+    ),
+    Sweep(
+        what="eikonal loss of a ball at borders of cells and of the box, 47 to 192 nodes",
+        usual_formula="a central difference over a fiftieth of a cell",
+        usual=lambda: border_eikonal_error(slope_across_the_border),
+        ours=lambda: border_eikonal_error(slope_of_a_cell),
+        tolerance=1e-3,
+    ),
+    Sweep(
+        what="a plane's gradient by differences, steps of 1/512 to 1/64, at the box's sides too",
+        usual_formula="over twice the step, also where a tap is moved to the side",
+        usual=lambda: difference_error(over_twice_the_step),
+        ours=lambda: difference_error(lambda x, step: central_gradient(slanted, x, step)),
+        tolerance=2e-4,  # a digit of the distance over 1/512
+        usual_holds=("inside",),
+    ),
+    Sweep(
+        what="the same with a step that is lost in the digits",
+        usual_formula="a step of 1e-6",
+        usual=lambda: difference_error(lambda x, _: central_gradient(slanted, x, 1e-6)),
+        ours=lambda: difference_error(lambda x, step: central_gradient(slanted, x, step)),
+        tolerance=2e-4,
+    ),
+    Sweep(
+        what="features of a hash grid on nodes, a digit beside them, on and beyond the box",
+        usual_formula="stopping 1e-4 of a cell before the last node",
+        usual=lambda: hash_value_error(lambda x: hashed(x.clamp(-1, 1 - 2e-4 / max(CELLS)))),
+        ours=lambda: hash_value_error(hashed),
+        tolerance=5e-5,  # a digit of the place is 1e-5 of the finest cell
+    ),
+    Sweep(
+        what="their gradient there, against that of a cell beside, in cells of the finest level",
+        usual_formula="the cell of floor(x): beyond the last node at the far side",
+        usual=lambda: hash_slope_error(one_cell_beyond),
+        ours=lambda: hash_slope_error(hashed),
+        tolerance=1e-2,
+    ),
+    Sweep(
         what="derivative of the eikonal loss, |g| from 0 to 1e4, in shares of 1 + |g|",
         usual_formula="(|g| - 1)^2",
         usual=lambda: eikonal_slope_error(plain_eikonal),
@@ -250,11 +447,12 @@ SWEEPS = (
         tolerance=1e-6,
     ),
     Sweep(
-        what="Taylor residual and its derivative, |g| from 0 to 1e4, in shares of 1 + |g|",
-        usual_formula="pulling by f g / |g|",
-        usual=lambda: taylor_error(pulled),
+        what="Taylor residual and its derivative, |g| from 0 to 1e4, in shares of 1 + |g| and itself",
+        usual_formula="|p - (q - f g / |g|^2)|, SparseCraft's published program",
+        usual=lambda: taylor_error(newton_pulled),
         ours=lambda: taylor_error(losses.taylor_at_query),
         tolerance=1e-6,
+        usual_holds=("|g| >= 1e-10",),
     ),
     Sweep(
         what="Neural-Pull's residual and its derivative, |g| from 0 to 1e4",
@@ -313,23 +511,15 @@ def test_sweep(sweep: Sweep) -> None:
     check(sweep)
 
 
-@pytest.mark.parametrize("nodes", NODES)
-def test_at_a_border_the_gradient_is_that_of_a_cell_beside_it(nodes: int) -> None:
-    """It jumps there; what must not happen is a mixture of both, or a slope over less than a cell."""
-    points = border_points(nodes)
-    _, found = value_and_gradient(ball(nodes).float(), locate(points, nodes))
-    inner = points.double().clamp(-1, 1)
-    step = 1e-3 * spacing(nodes)
-    apart = [
-        (
-            found - value_and_gradient(ball(nodes), locate(inner + step * torch.tensor([x, y, z]), nodes))[1]
-        ).abs()
-        for x in (-1, 1)
-        for y in (-1, 1)
-        for z in (-1, 1)
-    ]
-    # beside the border by a thousandth of a cell the other two coordinates have moved as well
-    assert torch.stack(apart).amax(dim=-1).amin(dim=0).max() < 5e-3
+@pytest.mark.parametrize("nodes", NODES[1:])
+def test_the_eikonal_loss_of_a_ball_pulls_at_borders_as_in_double_precision(nodes: int) -> None:
+    """At all border points, beyond the box too; in shares of what one of them can pull."""
+    corners = locate(border_points(nodes), nodes)
+    exact = replace(corners, weight=corners.weight.double(), slope=corners.slope.double())
+    found = gradient(lambda grid: losses.eikonal(value_and_gradient(grid, corners)[1]), ball(nodes).float())
+    true = gradient(lambda grid: losses.eikonal(value_and_gradient(grid, exact)[1]), ball(nodes))
+    one = 2 / spacing(nodes) / len(border_points(nodes))
+    assert largest(found, true, one) < 5e-4, "a few digits of the distance over a cell"
 
 
 def test_a_flat_place_has_no_normal_and_no_infinite_one() -> None:

@@ -9,6 +9,7 @@ import numpy as np
 import PIL.Image  # noqa: F401 - before pycolmap
 import pytest
 import torch
+import torch.nn.functional as F
 import trimesh
 
 from backend.maths.geometry import (
@@ -19,13 +20,16 @@ from backend.maths.geometry import (
     project,
     warp_pixels,
 )
+from backend.maths.nearest import nearest_tree
+from backend.maths.rays import first_crossing
 from backend.mesh_files import write_glb
-from backend.scene import Camera, Region, SolvedCameras, no_progress, transform_points
+from backend.scene import Camera, Region, SolvedCameras, StereoResult, no_progress, transform_points
 from backend.stages.mesh import MeshConfig, extract_mesh
 from backend.stages.region import RegionConfig, find_region
-from backend.stages.stereo import StereoResult, match_views
+from backend.stages.stereo import match_views
 from backend.stages.stereo_config import StereoConfig
-from backend.stages.train import Surface, TrainConfig, fit_surface
+from backend.stages.surface import Surface
+from backend.stages.train import TrainConfig, fit_surface
 from tests.synthetic_scene import (
     CENTRE,
     SIZE,
@@ -136,7 +140,7 @@ WORLDS = pytest.mark.parametrize(("scale", "shift"), [(1e-4, 0.0), (1e5, 0.0), (
 @pytest.mark.slow
 @WORLDS
 def test_the_result_is_the_same_in_any_world(scale: float, shift: float) -> None:
-    """Region, depths, field and mesh up to the similarity, to 1e-4 of the subject's size.
+    """Region, depths, field and mesh up to the similarity, to 1e-4 of the subject's size; simplified as well.
 
     The field gets its input to 1e-9. A point that this moves into the next cube of merged ones moves the
     nodes around by more, up to 1e-4 of the cube.
@@ -162,6 +166,33 @@ def test_the_result_is_the_same_in_any_world(scale: float, shift: float) -> None
     size = np.ptp(other.vertices, axis=0).max()
     assert np.abs((mesh.vertices - offset) / scale - other.vertices).max() < 1e-4 * size
     np.testing.assert_allclose(mesh.support, other.support, atol=1e-3)
+    # which edges are joined may hang on the last digit; the surface may not
+    fewer = MeshConfig(max_faces=2000)
+    mesh = extract_mesh(solved.views, region, stereo, surface, fewer, progress=no_progress)
+    other = extract_mesh(small_scene().views, *here, fewer, progress=no_progress)
+    assert len(other.faces) <= 2000
+    there = (mesh.vertices - offset) / scale
+    apart = np.concatenate(
+        [from_surface(there, other.vertices, other.faces), from_surface(other.vertices, there, mesh.faces)]
+    )
+    assert apart.max() < 1e-3 * size
+    assert apart.mean() < 1e-4 * size
+
+
+def from_surface(points: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Distance of each point from the nearest triangle; those whose middles are nearest are asked."""
+    triangles = vertices[faces]
+    _, near = nearest_tree(triangles.mean(axis=1)).query(points, k=32)
+    repeated = np.repeat(points, 32, axis=0)
+    closest = trimesh.triangles.closest_point(triangles[near.ravel()], repeated)
+    return np.asarray(np.linalg.norm(closest - repeated, axis=1).reshape(-1, 32).min(axis=1))
+
+
+def test_distances_from_a_surface_are_those_from_its_triangles() -> None:
+    ball = trimesh.creation.icosphere(3)
+    points = np.asarray(ball.triangles_center) * 1.25
+    expected = np.linalg.norm(points, axis=1) * 0.2
+    np.testing.assert_allclose(from_surface(points, ball.vertices, ball.faces), expected, rtol=1e-3)
 
 
 @WORLDS
@@ -214,6 +245,60 @@ def test_warps_in_single_precision() -> None:
         double = warp_pixels(*epipolar_map(exact[1], exact[0]), pixels.double(), inverse_depth)
         on_body = torch.tensor(np.isfinite(scene.depths[0]))
         assert float((single - double)[0][on_body].abs().max()) < tolerance_px
+
+
+def test_warps_in_single_precision_far_from_the_origin() -> None:
+    """A pixel to the world and into the other picture, at 1e6; ours never leaves the object's frame."""
+    solved = moved(small_scene(), 1.0, np.array([1e6, -1e6, 1e6]))
+    one, other = (view.camera for view in solved.views[:2])
+    scene, on_body = small_scene(), np.isfinite(small_scene().depths[0])
+    pixels = pixel_centres(one.width, one.height, CPU)
+    here = [in_double(view.camera) for view in scene.views[:2]]
+    inverse_depth = torch.tensor(true_region().radius_world / scene.depths[0])[None]
+    exact = warp_pixels(*epipolar_map(here[1], here[0]), pixels.double(), inverse_depth)[0][on_body]
+
+    depth = scene.depths[0][on_body].astype(np.float32)[:, None]
+    rays = np.column_stack([pixels.numpy()[on_body], np.ones(len(depth), np.float32)])
+    world_from_camera = np.linalg.inv(one.camera_from_world).astype(np.float32)
+    in_camera = rays @ np.linalg.inv(one.intrinsics).astype(np.float32).T * depth
+    in_world = in_camera @ world_from_camera[:3, :3].T + world_from_camera[:3, 3]
+    matrix = (other.intrinsics @ other.camera_from_world[:3]).astype(np.float32)
+    homogeneous = in_world @ matrix[:, :3].T + matrix[:, 3]
+    usual = torch.tensor(homogeneous[:, :2] / homogeneous[:, 2:])
+    assert float((usual - exact).abs().max()) > 1
+
+    object_from_world = true_region().object_from_world.copy()
+    object_from_world[:3, 3] -= object_from_world[:3, :3] @ np.array([1e6, -1e6, 1e6])
+    region = Region(object_from_world=object_from_world)
+    ours = warp_pixels(
+        *epipolar_map(pinhole_in_object(other, region, CPU), pinhole_in_object(one, region, CPU)),
+        pixels,
+        inverse_depth.float(),
+    )[0][on_body]
+    assert float((ours - exact).abs().max()) < 1e-3
+
+
+@pytest.mark.parametrize("scale", [1e-4, 1e5])
+def test_steps_in_units_of_the_world_miss_a_scene_of_another_size(scale: float) -> None:
+    """The same search for the surface of a ball of radius 0.5: its steps are 0.005 to 0.1 long.
+
+    In the world's frame they leap over a ball that is small, and end long before one that is large.
+    """
+    directions = F.normalize(torch.tensor([[0.0, 0.1, 1.0], [0.1, 0.0, 1.0], [0.0, 0.0, 1.0]]), dim=-1)
+    origins = torch.tensor([[0.0, 0.0, -1.0]]).expand(3, 3)
+    middle = -(origins * directions).sum(dim=-1)
+    exact = middle - (0.25 - 1 + middle.square()).sqrt()
+
+    def found(size: float) -> torch.Tensor:
+        start = torch.zeros(3)
+        crossing = first_crossing(
+            lambda x: x.norm(dim=-1) - 0.5 * size, size * origins, directions, start, reach=2.0 * size
+        )
+        return torch.where(crossing.hit, crossing.along / size, torch.nan)
+
+    torch.testing.assert_close(found(1.0), exact, rtol=0, atol=1e-4)
+    usual = found(scale)
+    assert not ((usual - exact).abs() < 1e-2).any(), "missed, or a hundredth of the size off"
 
 
 def in_double(camera: Camera) -> Pinhole:

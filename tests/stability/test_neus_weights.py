@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from backend.maths.volume import (
+    annealed_slope,
     blending_weights,
     log_transmittance,
     log_transmittance_of_middles,
@@ -147,6 +148,52 @@ def from_middles(distance: Tensor, sharpness: float) -> Tensor:
     return blending_weights(log_transmittance_of_middles(middle, slope, edges, sharpness))
 
 
+Pass = Callable[[Tensor, Tensor, Tensor, Tensor], Tensor]
+"""From distance, slope, edges and sharpness to the logs of the light that passes the intervals."""
+
+
+def pass_of_middles(distance: Tensor, slope: Tensor, edges: Tensor, sharpness: Tensor) -> Tensor:
+    return log_transmittance_of_middles(distance, slope, edges, sharpness)
+
+
+def published_pass_of_middles(distance: Tensor, slope: Tensor, edges: Tensor, sharpness: Tensor) -> Tensor:
+    """Of NeuS's published program; its opacities are asked for by their logs here."""
+    rise = 0.5 * slope * edges.diff(dim=-1)
+    before, after = (torch.sigmoid(sharpness * x) for x in (distance - rise, distance + rise))
+    alpha = ((before - after + 1e-5) / (before + 1e-5)).clamp(0, 1)
+    return torch.log(1 - alpha + 1e-7)
+
+
+def middles_gradient_error(log_pass: Pass) -> dict[str, float]:
+    """Of a pixel's colour by distance and slope, in logits, and by the log of the sharpness.
+
+    One unit of the first two moves a logit by 1, of the third all of them by a multiple of themselves.
+    """
+    return {
+        f"{name}, {done:g} of the annealing": max(
+            middles_slope_error(log_pass, case(count), s, done) for count in COUNTS for s in SHARPNESS
+        )
+        for name, case in {**FROM_OUTSIDE, "from inside": from_inside, "far behind": far_behind}.items()
+        for done in (0.0, 0.5, 1.0)
+    }
+
+
+def middles_slope_error(log_pass: Pass, distance: Tensor, sharpness: float, done: float) -> float:
+    edges = along(distance.shape[-1] - 1).expand_as(distance)
+    middle, slope = (distance[:, 1:] + distance[:, :-1]) / 2, distance.diff(dim=-1) / edges.diff(dim=-1)
+    colour = torch.rand((1, middle.shape[-1]), generator=torch.Generator().manual_seed(1))
+
+    def slopes(passing: Pass, dtype: torch.dtype) -> tuple[Tensor, ...]:
+        given = [x.to(dtype).requires_grad_() for x in (middle, slope, torch.tensor(sharpness))]
+        annealed = annealed_slope(given[1], done)
+        logs = passing(given[0], annealed, edges.to(dtype), given[2])
+        return torch.autograd.grad((blending_weights(logs) * colour.to(dtype)).sum(), given)
+
+    units = (sharpness, sharpness * float(edges.diff(dim=-1).max()), len(middle) / sharpness)
+    found, exact = slopes(log_pass, torch.float32), slopes(pass_of_middles, torch.float64)
+    return max(largest(one, other, unit) for one, other, unit in zip(found, exact, units, strict=True))
+
+
 SWEEPS = (
     Sweep(
         what="NeuS weights, sharpness 1 to 1e5, 2 to 1024 samples, from outside",
@@ -168,6 +215,13 @@ SWEEPS = (
         usual=lambda: gradient_error(lambda f, s: weights_of(quotient(f, s))),
         ours=lambda: gradient_error(ours),
         tolerance=1e-6,
+    ),
+    Sweep(
+        what="gradient by distance, annealed slope and sharpness in the middles, in logits",
+        usual_formula="as published, with epsilons",
+        usual=lambda: middles_gradient_error(published_pass_of_middles),
+        ours=lambda: middles_gradient_error(pass_of_middles),
+        tolerance=2e-4,  # a few of the logit's last digits
     ),
     Sweep(
         what="light lost in free space, 1024 samples, sharpness 1e3 to 1e5",

@@ -1,7 +1,7 @@
 """Where rays are sampled, waves of coordinates, and pictures read at their borders."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import pytest
 import torch
@@ -11,7 +11,7 @@ from backend.maths.encoding import positional_encoding
 from backend.maths.geometry import sample_image
 from backend.maths.radiance import proposal_loss
 from backend.maths.resampling import resample, strata
-from tests.stability.sweep import Sweep, check, gradient, largest
+from tests.stability.sweep import Errors, Sweep, check, gradient, largest
 
 INTERVALS = (2, 64, 1024)
 FREQUENCIES = 16
@@ -140,6 +140,31 @@ def proposal_slope_error(loss: Callable[[Tensor, Tensor], Tensor]) -> float:
     return max(largest(found[full], exact[full]), largest(found, found))
 
 
+# pictures at their borders
+
+Reading = Callable[[Tensor, Tensor], Tensor]
+"""From a picture and pixels to values, as `sample_image`."""
+
+
+def with_nothing_around(image: Tensor, pixels: Tensor) -> Tensor:
+    """torch's own reading as it comes: beyond the border all is 0."""
+    height, width = image.shape[1:]
+    grid = pixels / pixels.new_tensor([width / 2, height / 2]) - 1
+    return torch.nn.functional.grid_sample(image[None], grid, align_corners=False)
+
+
+def border_error(read: Reading) -> Errors:
+    """Of a ramp of 1 a pixel, in shares of the width: u + 1/2 up to the border, and the border's beyond."""
+    errors = {}
+    for width in (2, 3, 640, 6000):
+        image = 1 + torch.arange(float(width)).expand(1, 2, width).contiguous()
+        u = torch.cat([torch.linspace(-3, 3, 601), torch.linspace(width - 3, width + 3, 601)])
+        pixels = torch.stack([u, torch.ones_like(u)], dim=-1)[None, None]
+        exact = 1 + (u.double() - 0.5).clamp(0, width - 1)
+        errors[f"{width} pixels"] = largest(read(image, pixels)[0, 0, 0], exact, width)
+    return errors
+
+
 SWEEPS = (
     Sweep(
         what="how far samples stray from a single spike of 1e-44 to 1, of the ray's length",
@@ -176,6 +201,13 @@ SWEEPS = (
         ours=lambda: wave_slope_error(our_waves),
         tolerance=1e-5,
     ),
+    Sweep(
+        what="pictures of 2 to 6000 pixels read at and beyond their borders, in widths",
+        usual_formula="nothing but 0 beyond the border",
+        usual=lambda: border_error(with_nothing_around),
+        ours=lambda: border_error(sample_image),
+        tolerance=1e-6,
+    ),
 )
 
 
@@ -184,18 +216,44 @@ def test_sweep(sweep: Sweep) -> None:
     check(sweep)
 
 
+def by_their_sum(edges: Tensor, weights: Tensor, shares: Tensor) -> Tensor:
+    """The inverse of a distribution function as it is written: weights over their sum."""
+    below = torch.nn.functional.pad((weights / weights.sum(dim=-1, keepdim=True)).cumsum(dim=-1), (1, 0))
+    index = (torch.searchsorted(below, shares, right=True) - 1).clamp(0, weights.shape[-1] - 1)
+    low, high = below.gather(-1, index), below.gather(-1, index + 1)
+    return edges.gather(-1, index).lerp(edges.gather(-1, index + 1), (shares - low) / (high - low))
+
+
 @pytest.mark.parametrize("size", [0.0, 1e-45])
 def test_without_weight_every_place_counts_alike(size: float) -> None:
+    """Where weights are divided by their sum, 0 / 0 is no place at all."""
     edges = torch.linspace(0, 1, 1025)[None]
     shares = strata(1, 64, None, torch.device("cpu"))
-    torch.testing.assert_close(resample(edges, torch.full((1, 1024), size), shares), shares)
+    weights = torch.full((1, 1024), size)
+    torch.testing.assert_close(resample(edges, weights, shares), shares)
+    assert bool(by_their_sum(edges, weights, shares).isfinite().all()) == (size > 0)
 
 
-@pytest.mark.parametrize("width", [2, 3, 640, 6000])
-def test_pictures_are_read_to_a_millionth_of_their_width_at_their_borders(width: int) -> None:
-    """A ramp of 1 a pixel: its value at u is u - 1/2 up to the border, and the border's beyond."""
-    image = torch.arange(float(width)).expand(1, 2, width).contiguous()
-    u = torch.cat([torch.linspace(-3, 3, 601), torch.linspace(width - 3, width + 3, 601)])
-    pixels = torch.stack([u, torch.ones_like(u)], dim=-1)[None, None]
-    exact = (u.double() - 0.5).clamp(0, width - 1)
-    assert largest(sample_image(image, pixels)[0, 0, 0], exact, width) < 1e-6
+@pytest.fixture
+def _flushed() -> Iterator[None]:
+    """Denormal numbers are taken for 0, as in every run on the CPU."""
+    before = (torch.full((1,), 1e-39) * 0.5).item() == 0
+    if not torch.set_flush_denormal(True):
+        pytest.skip("this processor can not take denormal numbers for 0")
+    yield
+    torch.set_flush_denormal(before)
+
+
+@pytest.mark.usefixtures("_flushed")
+def test_spikes_where_denormal_numbers_are_flushed() -> None:
+    """A denormal spike is no weight, and every place counts alike; others are met as exactly."""
+    assert (torch.full((1,), 1e-44) * 0.5).item() == 0, "they are flushed"
+    for edges, weights, where in spikes():
+        shares = strata(8, 128, None, torch.device("cpu"))
+        samples = resample(edges, weights, shares)
+        if weights.max().item() < torch.finfo(torch.float32).tiny:
+            torch.testing.assert_close(samples, shares, rtol=0, atol=1e-6)
+        else:
+            first, last = edges.gather(-1, where[:, None]), edges.gather(-1, where[:, None] + 1)
+            assert largest(samples, samples.clamp(first, last)) < 1e-6
+    assert strayed(with_epsilons) > 0.5

@@ -7,14 +7,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 
-from backend.benchmark import ablation
-from backend.benchmark.ablation import COLUMNS, PRESET, VARIANTS, Variant, is_random, measure_variants
+from backend.benchmark import ablation, variants
+from backend.benchmark.ablation import COLUMNS, inputs_of, is_random, measure_variants
 from backend.benchmark.measuring import Measurement
 from backend.benchmark.one_by_one import place
 from backend.benchmark.suites import CASES, SUITES, Case
 from backend.benchmark.summary import aggregate, table
+from backend.benchmark.variants import VARIANTS, Variant
 from backend.presets import PRESETS, Settings
 from backend.stages.photos import PhotosConfig
 from backend.stages.report import ReportConfig, flat_settings
@@ -22,9 +22,13 @@ from backend.stages.train import TrainConfig
 from benchmarks import ablation as command
 from tests.synthetic_scene import photographed, ring_cameras, write_scene
 
-DEFAULT = PRESETS[PRESET]
 CASE = Case(
-    name="toy", folder="toy", given=tuple(range(4)), cameras="images/transforms.json", truth="truth.ply"
+    name="toy",
+    folder="toy",
+    given=tuple(range(4)),
+    held_out=(5, 7),
+    cameras="images/transforms.json",
+    truth="truth.ply",
 )
 SMALL = Settings(
     photos=PhotosConfig(max_side_px=96),
@@ -33,47 +37,55 @@ SMALL = Settings(
 )
 QUICK = (
     Variant(name="as it is"),
-    Variant(name="without rendering", setting="train.steps", value=(0, 0)),
-    Variant(name="blind", setting="stereo.min_correlation", value=1.0),
+    Variant(name="without rendering", changes={"train.steps": (0, 0)}),
+    Variant(name="few faces", changes={"train.steps": (0, 0), "mesh.max_faces": 500}),
+    Variant(name="blind", changes={"stereo.min_correlation": 1.0}),
 )
 
 
 @pytest.mark.parametrize("variant", VARIANTS, ids=lambda variant: variant.name)
-def test_a_variant_changes_one_part(variant: Variant) -> None:
-    before, after = dict(flat_settings(DEFAULT)), dict(flat_settings(variant.of(DEFAULT)))
-    changed = [name for name in before if before[name] != after[name]]
-    changed += [] if variant.with_masks else ["masks"]
-    assert len(changed) == (0 if variant.name == "as it is" else 1)
-    assert changed in ([], ["masks"], [variant.setting])
+def test_a_variant_changes_what_it_names(variant: Variant) -> None:
+    before, after = dict(flat_settings(PRESETS[variant.preset])), dict(flat_settings(variant.settings))
+    assert {name for name in before if before[name] != after[name]} == set(variant.changes)
 
 
-@pytest.mark.parametrize("variant", [v for v in VARIANTS if v.setting], ids=lambda variant: variant.name)
+@pytest.mark.parametrize("variant", VARIANTS, ids=lambda variant: variant.name)
 def test_a_changed_setting_is_what_the_stage_expects(variant: Variant) -> None:
-    assert variant.setting is not None
-    before: object = DEFAULT
-    for name in variant.setting.split("."):
-        before = getattr(before, name)
-    assert type(variant.value) is type(before)
-    if isinstance(before, tuple):
-        assert isinstance(variant.value, tuple)
-        assert len(variant.value) == len(before)
+    for name, value in variant.changes.items():
+        before: object = PRESETS[variant.preset]
+        for part in name.split("."):
+            before = getattr(before, part)
+        assert type(value) is type(before) or None in (value, before)
 
 
-def test_variants_have_names_of_their_own_and_begin_with_the_default() -> None:
+@pytest.mark.parametrize("variant", VARIANTS, ids=lambda variant: variant.name)
+def test_every_level_has_its_rounds_and_steps(variant: Variant) -> None:
+    train = variant.settings.train
+    assert isinstance(train, TrainConfig)
+    assert len(train.levels) == len(train.rounds) == len(train.steps)
+
+
+def test_variants_have_names_of_their_own_and_begin_with_their_preset() -> None:
     assert len({variant.name for variant in VARIANTS}) == len(VARIANTS)
-    assert VARIANTS[0].of(DEFAULT) == DEFAULT
-    assert VARIANTS[0].with_masks
+    first = {variant.preset: variant for variant in reversed(VARIANTS)}
+    assert set(first) == {"balanced", "fast"}
+    for preset, variant in first.items():
+        assert variant == Variant(name=variant.name, preset=preset)
 
 
-@pytest.mark.parametrize("name", ["stereo.growth", "stero.growth_rounds", "train.linear"])
+def test_variants_differ_in_more_than_their_names() -> None:
+    parts = [(v.settings, v.with_masks, v.cameras_doubted) for v in VARIANTS]
+    assert len(set(parts)) == len(parts)
+
+
+@pytest.mark.parametrize("name", ["stereo.growth", "stero.growth_rounds", "train.linear.more"])
 def test_a_setting_that_is_not_there_is_refused(name: str) -> None:
-    variant = Variant(name="misspelt", setting=f"{name}.more" if name == "train.linear" else name)
     with pytest.raises((AttributeError, TypeError)):
-        variant.of(DEFAULT)
+        _ = Variant(name="misspelt", changes={name: None}).settings
 
 
 def test_only_rendering_is_random() -> None:
-    drawn = {variant.name for variant in VARIANTS if is_random(variant.of(DEFAULT))}
+    drawn = {variant.name for variant in VARIANTS if is_random(variant.settings)}
     assert drawn == {"with 100 steps of rendering"}
 
 
@@ -92,13 +104,13 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> list[Measurement]:
     """All quick variants, with two seeds."""
     folder = toy(tmp_path_factory.mktemp("toy") / "scene")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(ablation, "PRESETS", {PRESET: SMALL})
-        device = torch.device("cpu")
-        return list(measure_variants(CASE, folder, QUICK, num_seeds=2, device=device))
+        patch.setattr(variants, "PRESETS", {"balanced": SMALL})
+        patch.setattr(ablation, "set_up_torch", lambda _: None)  # it would last beyond this test
+        return list(measure_variants(CASE, folder, QUICK, num_seeds=2, device="cpu", done={}))
 
 
 def test_each_variant_is_run_once_or_as_often_as_there_are_seeds(runs: list[Measurement]) -> None:
-    expected = [("as it is", 0), ("as it is", 1), ("without rendering", 0)]
+    expected = [("as it is", 0), ("as it is", 1), ("without rendering", 0), ("few faces", 0)]
     assert [(run.preset, run.seed) for run in runs if run.failure is None] == expected
 
 
@@ -111,17 +123,53 @@ def test_what_finds_nothing_is_told_and_ends_nothing(runs: list[Measurement]) ->
         assert "agree on only" in run.failure
 
 
-def test_stereo_is_done_once_for_what_does_not_change_it(runs: list[Measurement]) -> None:
-    done = [run.numbers["stereo_s"] for run in runs if run.failure is None]
-    assert done[0] is not None
-    assert done[1:] == [None] * (len(done) - 1)
+def test_what_a_variant_does_not_change_is_done_once(runs: list[Measurement]) -> None:
+    """Two runs of it would hardly take the same time to the last digit."""
+    first, again, without, few = [run.numbers for run in runs if run.failure is None]
+    assert first["stereo_s"] == again["stereo_s"] == without["stereo_s"]
+    assert without["train_s"] == few["train_s"]
+    assert len({numbers["train_s"] for numbers in (first, again, without)}) == 3
+    assert len({numbers["mesh_s"] for numbers in (first, again, without, few)}) == 4
+
+
+def test_a_run_tells_what_it_cost(runs: list[Measurement]) -> None:
+    for run in runs:
+        if run.failure is None:
+            assert run.device == "cpu"
+            assert min(run.numbers[f"{stage}_processor_s"] for stage in ("stereo", "train", "mesh")) > 0
+            assert run.numbers["peak_memory_bytes"] > 1e8
+            assert 10 < run.numbers["held_out_psnr_db"] < 60
+
+
+def test_what_was_done_before_is_not_done_again(
+    runs: list[Measurement], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(variants, "PRESETS", {"balanced": SMALL})
+    done = {(run.preset, run.seed): run for run in runs}
+
+    def never(*_: object) -> tuple[Measurement, ablation.Known]:
+        raise AssertionError
+
+    folder = Path("nowhere")
+    again = measure_variants(CASE, folder, QUICK, num_seeds=2, device="cpu", done=done, alone=never)
+    assert list(again) == runs
+
+
+def test_inputs_change_with_the_variant_and_the_case_s_files(tmp_path: Path) -> None:
+    folder = toy(tmp_path / "scene")
+    first = inputs_of(CASE, folder, VARIANTS[0], "cpu", {})
+    assert inputs_of(CASE, folder, VARIANTS[0], "cpu", {}) == first
+    others = {inputs_of(CASE, folder, variant, "cpu", {}) for variant in VARIANTS[1:]}
+    assert len(others | {first}) == len(VARIANTS)
+    (folder / "truth.ply").write_bytes((folder / "truth.ply").read_bytes() + b" ")
+    assert inputs_of(CASE, folder, VARIANTS[0], "cpu", {}) != first
 
 
 def test_what_is_changed_reaches_the_surface(runs: list[Measurement]) -> None:
     first = {
         run.preset: run.numbers["whole_chamfer_percent"] for run in runs if run.seed == 0 and run.numbers
     }
-    assert len(set(first.values())) == len(first) == 2
+    assert len(set(first.values())) == len(first) == 3
 
 
 def test_errors_are_those_of_a_surface_near_the_truth(runs: list[Measurement]) -> None:
@@ -136,7 +184,7 @@ def test_the_table_has_a_row_for_each_variant(runs: list[Measurement]) -> None:
     assert [line.split("|")[2].strip() for line in lines[2:]] == [variant.name for variant in QUICK]
     assert " ± " in lines[2]
     assert " ± " not in lines[3]
-    assert lines[4].split("|")[3].strip() == "failed"
+    assert lines[5].split("|")[3].strip() == "failed"
 
 
 def test_without_masks_the_photographs_and_the_region_stay(tmp_path: Path) -> None:
@@ -145,6 +193,8 @@ def test_without_masks_the_photographs_and_the_region_stay(tmp_path: Path) -> No
     assert all(view.mask is not None for view in placed.views)
     assert all(view.mask is None for view in bare.views)
     assert bare.region is placed.region
+    assert placed.with_doubted_cameras().views == placed.views
+    assert placed.with_doubted_cameras().solved.estimated
     for before, after in zip(placed.views, bare.views, strict=True):
         np.testing.assert_array_equal(before.image_srgb, after.image_srgb)
 
@@ -153,14 +203,29 @@ def test_the_command_leaves_what_was_measured(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, runs: list[Measurement]
 ) -> None:
     toy(tmp_path / "toy")
+    asked: list[dict[tuple[str, int], Measurement]] = []
+
+    def measured(*_: object, done: dict[tuple[str, int], Measurement], **__: object) -> list[Measurement]:
+        asked.append(done)
+        return runs
+
     monkeypatch.setattr(command, "CASES", {"toy": CASE})
-    monkeypatch.setattr(command, "set_up_torch", lambda _: None)  # it would last beyond this test
-    monkeypatch.setattr(command, "measure_variants", lambda *_, **__: iter(runs))
+    monkeypatch.setattr(command, "_NAMES", {variant.name: variant for variant in QUICK})
+    monkeypatch.setattr(command, "measure_variants", measured)
     words = ["--cases", "toy", "--photos", str(tmp_path), "--output", str(tmp_path / "out")]
-    monkeypatch.setattr(sys, "argv", ["ablation", *words])
+    names = [variant.name for variant in QUICK]
+    monkeypatch.setattr(sys, "argv", ["ablation", *words, "--variants", *names])
     assert command.main() == 0
     results = json.loads((tmp_path / "out" / "results.json").read_text())
     assert [run["preset"] for run in results["runs"]] == [run.preset for run in runs]
+    assert not (tmp_path / "record").exists()
+    monkeypatch.setattr(sys, "argv", [*sys.argv, "--record", str(tmp_path / "record")])
+    assert command.main() == 0  # what failed is tried again
+    assert asked[0] == {}
+    record = json.loads((tmp_path / "record" / "ablation.json").read_text())
+    assert [run["preset"] for run in record["runs"]] == [run.preset for run in runs]
+    assert "| toy | few faces |" in (tmp_path / "record" / "ablation.md").read_text()
+    assert set(asked[1]) == {(run.preset, run.seed) for run in runs if run.failure is None}
     text = (tmp_path / "out" / "table.md").read_text()
     assert text.startswith(table(aggregate(runs), COLUMNS, compared="variant"))
     assert "- toy, blind: The photographs agree on only" in text

@@ -7,28 +7,30 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 
+from backend import machine
 from backend.benchmark import suites
+from backend.benchmark.measuring import measuring_fingerprint
 from backend.benchmark.suites import Case, Suite
 from backend.commands import benchmark as command
 from backend.commands.cancelling import EXIT_CANCELLED, CancelRequest
 from backend.commands.reconstruct import EXIT_FINE, EXIT_USER_ERROR
 
-# The small stages of the end-to-end tests, but for photographs given as files rather than as a folder.
+# The small stages of the end-to-end tests; they must get the photographs that the case gives, and no others.
 PROGRAM = """
 import sys
-from pathlib import Path
 from backend.commands import reconstruct
 from tests.end_to_end import fake_stages
 
-folder_stage = fake_stages.load_photos
+any_photos = fake_stages.load_photos
 
 def load_photos(sources, masks, config, *, progress):
     assert [path.name for path in sources] == ["0.png", "2.png", "4.png"]
-    return folder_stage((sources[0].parent,), masks, config, progress=progress)
+    return any_photos(sources, masks, config, progress=progress)
 
-load_photos.__annotations__ = folder_stage.__annotations__
+load_photos.__annotations__ = any_photos.__annotations__
 fake_stages.load_photos = load_photos
 fake_stages.real_resolve = reconstruct.resolve
 reconstruct.resolve = fake_stages.resolve_and_replace
@@ -95,6 +97,8 @@ def test_everything_is_run_measured_and_written(
     assert numbers["peak_memory_bytes"] > 1e7
     assert 0.0 <= numbers["held_out_covered_share"] <= 1.0
     assert numbers["visible_chamfer_percent"] is None
+    assert numbers["watertight"] in (0.0, 1.0)
+    assert {run["device"] for run in results["runs"]} == {"cpu"}
     assert "| toy | fast |" in (output / "table.md").read_text()
     said = capsys.readouterr()
     assert "lost" in said.err
@@ -183,11 +187,30 @@ def test_a_benchmark_goes_on_where_it_was(
     runs = json.loads((output / "results.json").read_text())["runs"]
     assert [run["preset"] for run in runs] == ["balanced", "fast"]
     assert runs[1] == fast
+    assert not (tmp_path / "record").exists()
+    third = parsed(photos, output, "--seeds", "1", "--presets", "fast", "--record", str(tmp_path / "record"))
+    assert command.benchmark(third, program=("none",)) == EXIT_FINE
+    record = json.loads((tmp_path / "record" / "toy.json").read_text())
+    assert record["code"] == measuring_fingerprint()
+    assert [run["preset"] for run in record["runs"]] == ["fast", "balanced"]
+    assert str(tmp_path) not in (tmp_path / "record" / "toy.json").read_text()
     assert "Kept from before" in capsys.readouterr().err
     Image.new("RGBA", (32, 24)).save(photos / "toy" / "images" / "0.png")
     assert command.benchmark(first, program=fake_program()) == EXIT_FINE
     (again,) = json.loads((output / "results.json").read_text())["runs"]
     assert again["inputs"] != fast["inputs"]
+
+
+def test_what_another_device_gave_stays(
+    photos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    output = tmp_path / "out"
+    words = parsed(photos, output, "--seeds", "1", "--presets", "fast")
+    assert command.benchmark(words, program=fake_program()) == EXIT_FINE
+    monkeypatch.setattr(machine, "choose_device", lambda _kind: torch.device("meta"))
+    assert command.benchmark(words, program=fake_program()) == EXIT_FINE
+    runs = json.loads((output / "results.json").read_text())["runs"]
+    assert [(run["device"], bool(run["numbers"])) for run in runs] == [("meta", False), ("cpu", True)]
 
 
 def test_a_stop_ends_the_run_and_says_so(

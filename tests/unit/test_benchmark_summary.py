@@ -1,5 +1,6 @@
 """Laws of the Pareto front, of medians and of the table; the plot is an SVG of known parts."""
 
+import json
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -11,6 +12,7 @@ from hypothesis import strategies as st
 
 from backend.benchmark.measuring import Measurement
 from backend.benchmark.plot import budget_curve, colour_difference_percent, draw, points_of
+from backend.benchmark.record import write_record
 from backend.benchmark.summary import COST_COLUMNS, Column, aggregate, error_columns, pareto_front, table
 from backend.benchmark.writing import tables
 
@@ -91,9 +93,62 @@ def test_the_table_has_each_case_and_preset_once() -> None:
 def test_the_whole_surface_s_table_ends_with_what_support_foretells() -> None:
     (summary,) = aggregate([run("a", "fast", 0, {"support_auc": 0.8754})])
     head, _, row = table((summary,), error_columns("whole")).splitlines()
-    assert head.endswith("| support AUC |")
-    assert row.endswith("| 0.875 |")
+    assert head.endswith("| support AUC | closed |")
+    assert row.endswith("| 0.875 | - |")
     assert "AUC" not in table((summary,), error_columns("visible"))
+
+
+@pytest.mark.parametrize(("runs_closed", "said"), [((1, 1, 1), "yes"), ((0, 0), "no"), ((1, 0, 1), "no")])
+def test_a_surface_is_called_closed_where_all_runs_closed_it(runs_closed: tuple[int, ...], said: str) -> None:
+    runs = [run("a", "fast", seed, {"watertight": float(is_)}) for seed, is_ in enumerate(runs_closed)]
+    assert table(aggregate(runs), error_columns("whole")).splitlines()[-1].endswith(f"| {said} |")
+
+
+def test_several_devices_have_rows_and_a_column_of_their_own() -> None:
+    runs = runs_of(["a"], ["fast"])
+    assert "device" not in table(aggregate(runs), COST_COLUMNS)
+    runs = [replace(r, device=device) for device in ("cpu", "cuda") for r in runs]
+    lines = table(aggregate(runs), COST_COLUMNS).splitlines()
+    assert lines[0].startswith("| case | preset | device |")
+    assert [line.split("|")[3].strip() for line in lines[2:]] == ["cpu", "cuda"]
+    assert {line.count("|") for line in lines} == {len(COST_COLUMNS) + 4}
+
+
+def test_the_plot_tells_devices_apart(tmp_path: Path) -> None:
+    runs = [replace(r, device=device) for device in ("cpu", "cuda") for r in runs_of(["a"], ["fast"])]
+    draw(tmp_path / "plot.svg", aggregate(runs))
+    root = ElementTree.parse(tmp_path / "plot.svg").getroot()
+    words = ["".join(text.itertext()) for text in root.iter(f"{SVG}text")]
+    assert [words.count(f"a, fast on {device}") for device in ("cpu", "cuda")] == [1, 1]
+
+
+def test_a_record_has_every_run_and_no_folder_of_this_machine(tmp_path: Path) -> None:
+    wrong = failed("b", "fast", "could not read '/home/me/photos/1.png': gone, see C:\\me\\log.txt")
+    runs = [*runs_of(["a"], ["fast"]), wrong]
+    runs[0] = replace(runs[0], device="cpu", numbers={"stereo_s": 1.23456789, "x": None})
+    about = {"suite": "toy", "machine": {"cores": 2}, "seeds": [0, 1, 2], "missing": ("lost",)}
+    write_record(tmp_path / "new" / "results", about, runs, code="c0de", date="2026-01-02")
+    assert {path.name for path in (tmp_path / "new" / "results").iterdir()} == {"toy.json", "toy.md"}
+    text = (tmp_path / "new" / "results" / "toy.json").read_text()
+    written = json.loads(text)
+    assert written["machine"] == {"cores": 2}
+    assert (written["code"], written["date"], written["seeds"]) == ("c0de", "2026-01-02", [0, 1, 2])
+    assert written["versions"] == {"FewView": "1"}
+    assert len(written["runs"]) == len(runs)
+    assert written["runs"][0] == {
+        "case": "a",
+        "preset": "fast",
+        "budget_s": None,
+        "device": "cpu",
+        "seed": 0,
+        "numbers": {"stereo_s": 1.23457, "x": None},
+    }
+    assert written["runs"][-1]["failure"] == "could not read '1.png': gone, see log.txt"
+    assert text.count("\n") == len(runs) + len(about) + 3 + 4  # a line for each run and each fact
+    table_text = (tmp_path / "new" / "results" / "toy.md").read_text()
+    assert "| a | fast |" in table_text
+    assert "1.png" in table_text
+    assert "home" not in text + table_text
 
 
 def test_a_cell_shows_the_median_and_half_the_range_in_its_unit() -> None:

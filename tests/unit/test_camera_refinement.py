@@ -4,13 +4,14 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
 from itertools import combinations
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from backend.scene import Camera, SurfacePoints, View, no_progress, transform_points
+from backend.scene import Camera, StereoResult, SurfacePoints, View, no_progress, transform_points
 from backend.stages import camera_refinement
 from backend.stages.camera_refinement import (
     Sightings,
@@ -22,7 +23,6 @@ from backend.stages.camera_refinement import (
     with_cameras,
     with_refined,
 )
-from backend.stages.stereo import StereoResult
 from backend.stages.stereo_config import StereoConfig
 from tests.synthetic_scene import (
     DISTANCE,
@@ -196,6 +196,23 @@ def test_a_camera_that_shares_nothing_does_no_harm() -> None:
         largest_move_px([views[2].camera], refined.cameras[2:], sightings_between(scene().cameras).positions)
         < 4
     )
+
+
+class OnAppleGpu(torch.Tensor):
+    """A tensor that can be made float64 only where it has come to the CPU."""
+
+    @classmethod
+    def __torch_function__(cls, function: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        if function in (torch.Tensor.double, torch.Tensor.to) or (kwargs or {}).get("dtype") == torch.float64:
+            raise TypeError("Cannot convert a MPS Tensor to float64 dtype")
+        result = super().__torch_function__(function, types, args, kwargs or {})
+        return result.as_subclass(torch.Tensor) if function is torch.Tensor.cpu else result
+
+
+def test_numbers_leave_a_device_that_knows_no_float64() -> None:
+    parts = [torch.zeros((0, 2)).as_subclass(OnAppleGpu), torch.ones((3, 2)).as_subclass(OnAppleGpu)]
+    joined = camera_refinement._float64(parts)
+    np.testing.assert_array_equal(joined, np.ones((3, 2)), strict=True)
 
 
 def test_moves_are_measured_in_pixels() -> None:

@@ -1,6 +1,7 @@
 """Cameras from photographs of a rendered corner, and lens refinement on synthetic points."""
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -83,6 +84,23 @@ def check_evidence(solved: SolvedCameras) -> None:
         assert (np.linalg.eigvalsh(covariance) > -1e-15).all()
         turn_deg = np.degrees(np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1]))
         assert 0.003 < turn_deg < 3, "true errors are about 0.1 degrees"
+
+
+def test_the_mean_error_is_in_each_photograph_s_own_pixels(corner: list[Photo], tmp_path: Path) -> None:
+    """One of three is twice as large: its errors count twice as much."""
+    config = replace(CONFIG, sfm_max_side_px=WIDTH)
+    large = make_photo("2.png", np.kron(corner[2].image_srgb, np.ones((2, 2, 1), np.float32)))
+    alike, mixed = (
+        solve_cameras(photos, None, config, workdir=tmp_path, seed=0, progress=no_progress)
+        for photos in (corner, [*corner[:2], large])
+    )
+    assert alike.reprojection_error_px is not None
+    assert mixed.reprojection_error_px is not None
+    ratio = mixed.reprojection_error_px / alike.reprojection_error_px
+    assert ratio == pytest.approx(4 / 3, rel=0.1)
+    assert mixed.evidence is not None
+    mean_px = (mixed.evidence.error_px.sum(axis=1) / mixed.sparse_visibility.sum(axis=1)).mean()
+    assert mean_px == pytest.approx(mixed.reprojection_error_px)
 
 
 def test_sparse_points_project_to_what_sees_them(corner: list[Photo], tmp_path: Path) -> None:

@@ -14,6 +14,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from backend.errors import ErrorCode, ReconstructionError
+from backend.mesh_files import write_sparse
 from backend.scene import Photo, Region, SolvedCameras, Unplaced, no_progress, to_unit_sphere
 from backend.stages.cameras import CamerasConfig, solve_cameras
 from backend.stages.known_cameras import checked_pose, match_by_name, read_cameras
@@ -198,6 +199,73 @@ def test_the_file_tells_more_than_readers_need(tmp_path: Path) -> None:
     }
 
 
+def estimated_before(tmp_path: Path) -> SolvedCameras:
+    """Cameras of a.jpg and c.jpg as an earlier job estimated them, whose files lie in the folder."""
+    rng = np.random.default_rng(0)
+    found = replace(
+        solve_frames(PHOTOS, {"frames": [FRAMES[0], FRAMES[2]]}, tmp_path),
+        estimated=True,
+        reprojection_error_px=0.4,
+        unplaced=(Unplaced(name="b.jpg", why="it is blurred"),),
+        sparse_positions=rng.normal(size=(30, 3)),
+        sparse_visibility=np.ones((30, 2), bool),
+    )
+    (tmp_path / "cameras.json").write_text(json.dumps(transforms_json(found, REGION)))
+    points, seen = found.sparse_positions, found.sparse_visibility
+    colours = np.zeros((30, 3), np.uint8)
+    write_sparse(tmp_path / "sparse.ply", positions=points, colours_srgb=colours, visibility=seen)
+    return found
+
+
+def test_cameras_that_were_estimated_stay_so_in_a_later_job(tmp_path: Path) -> None:
+    first = estimated_before(tmp_path)
+    again = solve(PHOTOS, tmp_path / "cameras.json", tmp_path)
+    assert again.estimated
+    assert again.reprojection_error_px == 0.4
+    assert again.unplaced == first.unplaced
+    np.testing.assert_array_equal(again.sparse_positions, first.sparse_positions)
+    np.testing.assert_array_equal(again.sparse_visibility, first.sparse_visibility)
+    for view, other in zip(first.views, again.views, strict=True):
+        np.testing.assert_allclose(other.camera.camera_from_world, view.camera.camera_from_world, atol=1e-12)
+    assert "cameras.json" in again.decisions[0].because
+
+
+def test_points_that_two_of_fewer_photographs_see(tmp_path: Path) -> None:
+    found = estimated_before(tmp_path)
+    seen = np.ones((30, 3), bool)
+    seen[:10, 0] = False
+    cameras = transforms_json(solve_frames(PHOTOS, {"frames": FRAMES}, tmp_path), REGION)
+    cameras["fewview"]["estimated"] = True
+    (tmp_path / "cameras.json").write_text(json.dumps(cameras))
+    points, colours = found.sparse_positions, np.zeros((30, 3), np.uint8)
+    write_sparse(tmp_path / "sparse.ply", positions=points, colours_srgb=colours, visibility=seen)
+    fewer = solve(PHOTOS[:2], tmp_path / "cameras.json", tmp_path)
+    np.testing.assert_array_equal(fewer.sparse_positions, points[10:])
+    assert fewer.sparse_visibility.shape == (20, 2)
+
+
+def test_a_photograph_that_was_left_out_takes_no_namesake_s_camera(tmp_path: Path) -> None:
+    photos = [replace(make_photo("a.jpg"), path=Path(folder) / "a.jpg") for folder in ("left", "right")]
+    content = transforms_json(solve_frames(PHOTOS, {"frames": FRAMES}, tmp_path), REGION)
+    content["fewview"] |= {"estimated": True, "unplaced": [{"name": "left/a.jpg", "why": "it is dark"}]}
+    content["frames"][0]["file_path"] = "right/a.jpg"
+    solved = solve_frames([*photos, PHOTOS[1]], content, tmp_path)
+    assert [view.name for view in solved.views] == ["a.jpg", "b.jpg"]
+    assert [photo.why for photo in solved.unplaced] == ["it is dark"]
+    only_left = solve_frames([photos[0], *PHOTOS[1:]], content, tmp_path)
+    assert [view.name for view in only_left.views] == ["b.jpg", "c.jpg"]
+
+
+@pytest.mark.parametrize(
+    "ours", [{"estimated": 1}, {"estimated": True, "unplaced": 3, "reprojection_error_px": "x"}, 7, None]
+)
+def test_words_of_others_under_our_name_do_no_harm(ours: object, tmp_path: Path) -> None:
+    solved = solve_frames(PHOTOS, {"frames": FRAMES, "fewview": ours}, tmp_path)
+    assert len(solved.views) == 3
+    assert solved.reprojection_error_px is None
+    assert solved.sparse_positions.shape == (0, 3)
+
+
 def test_the_model_stands_at_the_top_where_all_share_it(tmp_path: Path) -> None:
     fisheye = [frame | {"camera_model": "OPENCV_FISHEYE"} for frame in FRAMES]
     for frames, model in (
@@ -219,7 +287,7 @@ def test_the_model_stands_at_the_top_where_all_share_it(tmp_path: Path) -> None:
         ("FOV", [100.0, 100.0, 30.0, 20.0, True], "none of COLMAP's models"),
         ("FOV", [1.0], "too few or too many"),
         ("EQUIRECTANGULAR", [64.0, 48.0], "too few or too many"),
-        ("FOV", [100.0, 100.0, 30.0, 20.0, float("nan")], "no usable number"),
+        ("FOV", [100.0, 100.0, 30.0, 20.0, float("nan")], "not finite and positive"),
     ],
 )
 def test_colmap_s_words_are_checked(model: str, params: object, words: str, tmp_path: Path) -> None:

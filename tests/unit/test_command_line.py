@@ -69,6 +69,18 @@ def test_wrong_budgets_end_with_a_sentence(
     assert not jobs
 
 
+@pytest.mark.parametrize("command", ["reconstruct", "cameras", "fit-points"])
+@pytest.mark.parametrize("number", ["-1", "2147483648", "1.5"])
+def test_wrong_seeds_end_with_a_sentence(
+    jobs: list[Job], command: str, number: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as ended:
+        program.run([command, "photos", "--output", "o", "--seed", number])
+    assert ended.value.code == 2
+    assert "--seed" in capsys.readouterr().err
+    assert not jobs
+
+
 def test_install_and_remove_get_their_words(monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[Any] = []
     monkeypatch.setattr(program.install, "install", lambda plan: asked.append(plan) or 0)
@@ -121,12 +133,40 @@ def test_threads_that_wait_leave_the_cores_to_others(
     expected: dict[str, str],
 ) -> None:
     """At once where the computer is busy, else soon; but as the user says if he does."""
-    load = tmp_path / "loadavg"
-    load.write_text(f"5.00 5.00 5.00 {running}/250 4711\n", encoding="ascii")
-    environment = dict(chosen)
-    monkeypatch.setattr(waiting, "_LOAD", load)
-    monkeypatch.setattr(os, "environ", environment)
-    monkeypatch.setattr(os, "cpu_count", lambda: 4)
+    environment = pretended(monkeypatch, tmp_path / "loadavg", chosen, running)
     monkeypatch.setattr(program, "run", lambda _arguments: 0)
     program.main([])
     assert environment == expected
+
+
+def pretended(
+    monkeypatch: pytest.MonkeyPatch, load: Path, chosen: dict[str, str], running: int
+) -> dict[str, str]:
+    """The environment that a process with four cores finds, of which so many are wanted."""
+    load.write_text(f"5.00 5.00 5.00 {running}/250 4711\n", encoding="ascii")
+    environment = dict(chosen)
+    monkeypatch.setattr(waiting, "_LOAD", load)
+    monkeypatch.setattr(waiting, "_chosen", {})
+    monkeypatch.setattr(os, "environ", environment)
+    monkeypatch.setattr(os, "cpu_count", lambda: 4)
+    return environment
+
+
+def test_a_computer_that_became_busy_is_looked_at_again(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    environment = pretended(monkeypatch, tmp_path / "loadavg", {"HOME": "h"}, running=1)
+    waiting.set_waiting_policy()
+    assert environment == {"HOME": "h", **SHORTLY}
+    (tmp_path / "loadavg").write_text("5.00 5.00 5.00 9/250 4711\n", encoding="ascii")
+    waiting.set_waiting_policy()
+    assert environment == {"HOME": "h", **SLEEP}
+
+
+@pytest.mark.parametrize("chosen", [{}, SLEEP, SPIN, SHORTLY, AT_LENGTH])
+def test_a_process_that_is_started_gets_what_the_user_chose_and_looks_for_itself(
+    chosen: dict[str, str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    environment = pretended(monkeypatch, tmp_path / "loadavg", {"HOME": "h", **chosen}, running=1)
+    waiting.set_waiting_policy()
+    assert waiting.without_own_policy(environment) == {"HOME": "h", **chosen}

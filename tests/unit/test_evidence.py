@@ -66,7 +66,7 @@ def test_points_on_a_sphere_give_its_distance_to_second_order() -> None:
     assert (result.weight == 0)[truth.abs() > 4 * spacing(nodes)].all()
 
 
-def distances_one_by_one(points: Tensor, normals: Tensor, confidence: Tensor) -> Tensor:
+def distances_one_by_one(points: Tensor, normals: Tensor, confidence: Tensor, spread: float) -> Tensor:
     """Sums of weight x distance and of weight, point by point, in float64."""
     h = spacing(NODES)
     sums = np.zeros((NODES, NODES, NODES, 2))
@@ -78,18 +78,19 @@ def distances_one_by_one(points: Tensor, normals: Tensor, confidence: Tensor) ->
                 continue
             along = apart @ n
             across = np.linalg.norm(apart - along * n)
-            weight = c * np.exp(-((across / h) ** 2) - (along / (2 * h)) ** 2)
+            weight = c * np.exp(-((across / (spread * h)) ** 2) - (along / (2 * spread * h)) ** 2)
             sums[node] += weight * along, weight
     return torch.tensor(sums)
 
 
-def test_point_distances_match_the_definition() -> None:
+@pytest.mark.parametrize("spread", [0.7, 1.0, 1.4])
+def test_point_distances_match_the_definition(spread: float) -> None:
     """Points outside the cube, too, speak to the nodes they are near."""
     points = torch.cat([0.9 * random_points(12), torch.tensor([[1.2, 0.0, 0.0], [-1.1, -1.1, 0.3]])])
     normals = torch.nn.functional.normalize(random_points(14).flip(0), dim=-1)
     confidence = torch.linspace(0.2, 1, 14)
-    sums = distances_one_by_one(points, normals, confidence)
-    result = point_distances(points, normals, confidence, NODES)
+    sums = distances_one_by_one(points, normals, confidence, spread)
+    result = point_distances(points, normals, confidence, NODES, spread_cells=spread)
     spoken = sums[..., 1] > 1e-3
     torch.testing.assert_close(
         result.weight, torch.where(spoken, sums[..., 1], 0.0).float(), atol=1e-5, rtol=0
@@ -190,8 +191,11 @@ def test_points_without_confidence_leave_no_trace() -> None:
     alone = merged_points(positions[sure], normals[sure], confidence[sure], 0.05)
     torch.testing.assert_close(sorted_rows(*merged), sorted_rows(*alone), atol=1e-5, rtol=1e-5)
     assert all(x.isfinite().all() for x in merged)
-    nothing = merged_points(positions, normals, 0 * confidence, 0.05)
-    assert [len(x) for x in nothing] == [0, 0, 0]
+    for nothing in (
+        merged_points(positions, normals, 0 * confidence, 0.05),
+        merged_points(positions[:0], normals[:0], confidence[:0], 0.05),
+    ):
+        assert [x.shape for x in nothing] == [(0, 3), (0, 3), (0,)]
 
 
 def test_the_faces_of_a_thin_sheet_stay_apart() -> None:

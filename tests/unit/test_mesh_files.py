@@ -7,7 +7,15 @@ import numpy as np
 import pytest
 import trimesh
 
-from backend.mesh_files import MeshFileError, read_mesh, write_glb, write_mesh, write_points, write_sparse
+from backend.mesh_files import (
+    MeshFileError,
+    read_mesh,
+    read_sparse,
+    write_glb,
+    write_mesh,
+    write_points,
+    write_sparse,
+)
 from backend.scene import Region, SurfaceMesh, SurfacePoints
 
 
@@ -72,21 +80,43 @@ def test_the_header_names_every_property_and_its_size(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("count", [0, 7])
-def test_sparse_points_are_positions_and_colours(tmp_path: Path, count: int) -> None:
+def test_sparse_points_have_positions_colours_and_who_sees_them(tmp_path: Path, count: int) -> None:
     random = np.random.default_rng(0)
     positions, colours = random.normal(size=(count, 3)) + 5e6, random.integers(0, 256, (count, 3), np.uint8)
-    write_sparse(tmp_path / "sparse.ply", positions=positions, colours_srgb=colours)
+    visibility = random.random((count, 11)) < 0.5
+    what = {"positions": positions, "colours_srgb": colours, "visibility": visibility}
+    write_sparse(tmp_path / "sparse.ply", **what)
     header, _, body = (tmp_path / "sparse.ply").read_bytes().partition(b"end_header\n")
     lines = header.decode("ascii").splitlines()
     assert lines[:2] == ["ply", "format binary_little_endian 1.0"]
     assert lines[3:] == [
         f"element vertex {count}",
         *(f"property double {axis}" for axis in "xyz"),
-        *(f"property uchar {channel}" for channel in ("red", "green", "blue")),
+        *(f"property uchar {name}" for name in ("red", "green", "blue", "seen_0", "seen_1")),
     ]
-    rows = np.frombuffer(body, np.dtype([("xyz", "<f8", 3), ("rgb", "u1", 3)]))
+    rows = np.frombuffer(body, np.dtype([("xyz", "<f8", 3), ("rgb", "u1", 3), ("seen", "<u2")]))
     np.testing.assert_array_equal(rows["xyz"], positions)
     np.testing.assert_array_equal(rows["rgb"], colours)
+    np.testing.assert_array_equal(rows["seen"][:, None] >> np.arange(11) & 1, visibility)
+    read_positions, read_visibility = read_sparse(tmp_path / "sparse.ply", num_photos=11)
+    np.testing.assert_array_equal(read_positions, positions)
+    np.testing.assert_array_equal(read_visibility, visibility)
+
+
+def test_sparse_points_of_other_cameras_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "sparse.ply"
+    points = {"positions": np.ones((3, 3)), "colours_srgb": np.zeros((3, 3), np.uint8)}
+    write_sparse(path, **points, visibility=np.ones((3, 4), bool))
+    whole = path.read_bytes()
+    with pytest.raises(MeshFileError, match="20 cameras"):
+        read_sparse(path, num_photos=20)
+    for content in (whole[:-1], whole + b"0", whole.replace(b"vertex 3", b"vertex 2"), b"", b"end_header\n"):
+        path.write_bytes(content)
+        with pytest.raises(MeshFileError):
+            read_sparse(path, num_photos=4)
+    write_sparse(path, **points | {"positions": np.full((3, 3), np.nan)}, visibility=np.ones((3, 4), bool))
+    with pytest.raises(MeshFileError, match="not finite"):
+        read_sparse(path, num_photos=4)
 
 
 def test_the_same_mesh_gives_the_same_bytes(tmp_path: Path) -> None:

@@ -4,13 +4,26 @@ import pytest
 import torch
 from torch import Tensor
 
+from backend.presets import PRESETS
 from backend.stages.networks import HashConfig, Linear, NetworkConfig, NeuralSurface
+from backend.stages.neus_fit import NeusConfig
+
+
+def published(name: str) -> NetworkConfig:
+    train = PRESETS[f"{name}-published"].train
+    assert isinstance(train, NeusConfig)
+    return train.network
+
 
 HASHED = HashConfig(levels=4, finest=32, most_rows=1000)
 SHAPES = [
     pytest.param(NetworkConfig(), id="neus"),
     pytest.param(NetworkConfig(layers=1, hash_grid=HASHED, albedo_and_specular=True), id="sparsecraft"),
-    pytest.param(NetworkConfig(width=256, layers=8, features=255), id="published"),
+    pytest.param(published("neus"), id="neus as published"),
+    pytest.param(
+        NetworkConfig(layers=1, hash_grid=HASHED, albedo_and_specular=True, spherical_harmonics=True),
+        id="harmonics",
+    ),
 ]
 
 
@@ -26,6 +39,34 @@ def in_unit_ball(num: int, seed: int = 1) -> Tensor:
 def unit(num: int, seed: int) -> Tensor:
     draws = torch.randn(num, 3, generator=torch.Generator().manual_seed(seed))
     return torch.nn.functional.normalize(draws, dim=-1)
+
+
+def sizes(layers: torch.nn.ModuleList) -> list[tuple[int, ...]]:
+    return [tuple(layer.direction.shape) for layer in layers]
+
+
+def test_published_sizes_are_those_of_the_programs() -> None:
+    """NeuS: 6 waves of places, 4 of directions, 256 features. SparseCraft: 67 numbers of a place, 16 features
+    with it, 16 harmonics; some 19 million numbers in tables."""
+    neus = made(published("neus"))
+    inside = [(256, 39), (256, 256), (256, 256), (217, 256), *[(256, 256)] * 4]
+    assert sizes(neus.distance_network.hidden) == inside
+    assert tuple(neus.distance_network.last.direction.shape) == (257, 256)
+    assert sizes(neus.directed.layers) == [(256, 289), *[(256, 256)] * 3, (3, 256)]
+    sparsecraft = made(published("sparsecraft"))
+    assert sizes(sparsecraft.distance_network.hidden) == [(64, 67)]
+    assert sparsecraft.albedo is not None
+    assert sizes(sparsecraft.albedo.layers) == [(64, 16), (64, 64), (64, 64), (3, 64)]
+    assert sizes(sparsecraft.directed.layers) == [(64, 35), (64, 64), (64, 64), (1, 64)]
+    assert 18e6 < sum(table.numel() for table in sparsecraft.tables) < 20e6
+
+
+def test_waves_may_be_as_long_as_neus_has_them() -> None:
+    """sin(2^k x) and cos(2^k x)."""
+    x = in_unit_ball(50)
+    waves = [torch.sin(2.0**k * x) for k in range(6)] + [torch.cos(2.0**k * x) for k in range(6)]
+    found = made(published("neus"))._waves(x, 6)
+    torch.testing.assert_close(found, torch.cat(waves, dim=-1), rtol=0, atol=1e-5)
 
 
 @pytest.mark.parametrize("config", SHAPES)

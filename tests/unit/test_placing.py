@@ -11,7 +11,6 @@ from addon.placing import (
     similarity_between,
     solved_from_camera,
     sphere_around,
-    up_direction,
     upright_from_solved,
     weighted_quantile,
 )
@@ -22,6 +21,7 @@ from addon.view_layout import (
     unit_vectors,
     world_from_camera_looking_at,
 )
+from backend.maths.upright import up_direction
 
 CENTRE = np.array([0.3, -0.2, 0.9])
 ARC = ViewLayout(kind=LayoutKind.ARC, num_views=6, arc_deg=120.0, elevation_deg=25.0, jitter=0.0)
@@ -37,6 +37,15 @@ def level_cameras(layout: ViewLayout, *, roll_deg: Array | None = None, distance
             for unit, roll in zip(towards, rolls, strict=True)
         ]
     )
+
+
+def up_of(poses: Array) -> Array:
+    """(3,): of cameras with Blender's axes."""
+    return up_direction(*np.moveaxis(poses[:, :3, :3], 2, 0))
+
+
+def placed_upright(poses: Array, centre: Array, radius: float, *, points: Array | None = None) -> Array:
+    return upright_from_solved(poses, centre, radius, up=up_of(poses), points=points)
 
 
 def random_rotation(rng: np.random.Generator) -> Array:
@@ -82,7 +91,7 @@ def test_level_cameras_come_out_level(layout: ViewLayout, seed: int) -> None:
     cameras = level_cameras(layout)
     poses, scale = solved(solved_from_world, cameras)
     centre = solved_from_world[:3, :3] @ CENTRE + solved_from_world[:3, 3]
-    upright = upright_from_solved(poses, centre, 0.7 * scale)
+    upright = placed_upright(poses, centre, 0.7 * scale)
 
     upright_from_world = upright @ solved_from_world
     linear = upright_from_world[:3, :3] * 0.7
@@ -96,7 +105,7 @@ def test_level_cameras_come_out_level(layout: ViewLayout, seed: int) -> None:
 @pytest.mark.parametrize("azimuth_deg", [0.0, 77.0, 200.0])
 def test_the_mean_view_looks_along_y(azimuth_deg: float) -> None:
     cameras = level_cameras(replace(ARC, azimuth_deg=azimuth_deg))
-    upright = upright_from_solved(cameras, CENTRE, 1.0)
+    upright = placed_upright(cameras, CENTRE, 1.0)
     mean = -(upright[:3, :3] @ cameras[:, :3, 2].mean(axis=0))
     assert mean[0] == pytest.approx(0.0, abs=1e-9)
     assert mean[1] > 0.5
@@ -105,12 +114,12 @@ def test_the_mean_view_looks_along_y(azimuth_deg: float) -> None:
 def test_the_placing_follows_the_solved_frame() -> None:
     rng = np.random.default_rng(3)
     poses = level_cameras(ARC, roll_deg=rng.normal(size=6))
-    direct = upright_from_solved(poses, CENTRE, 0.5)
+    direct = placed_upright(poses, CENTRE, 0.5)
     for _ in range(5):
         solved_from_world = random_similarity(rng)
         moved, scale = solved(solved_from_world, poses)
         centre = solved_from_world[:3, :3] @ CENTRE + solved_from_world[:3, 3]
-        again = upright_from_solved(moved, centre, 0.5 * scale)
+        again = placed_upright(moved, centre, 0.5 * scale)
         np.testing.assert_allclose(again @ solved_from_world, direct, atol=1e-8)
 
 
@@ -119,17 +128,15 @@ def test_the_placing_follows_the_solved_frame() -> None:
 def test_one_camera_on_its_side_changes_nothing(rolled_deg: float, arc_deg: float) -> None:
     rolls = np.array([0.0, 0.0, rolled_deg, 0.0, 0.0, 0.0])
     layout = replace(ARC, arc_deg=arc_deg, elevation_deg=20.0)
-    rolled = up_direction(level_cameras(layout, roll_deg=rolls))
-    others = up_direction(np.delete(level_cameras(layout), 2, axis=0))
+    rolled = up_of(level_cameras(layout, roll_deg=rolls))
+    others = up_of(np.delete(level_cameras(layout), 2, axis=0))
     assert angle_deg(rolled, others) < (2.5 if arc_deg < 30 else 0.5)
 
 
 def test_a_hand_that_shakes_moves_up_little() -> None:
     rng = np.random.default_rng(0)
     errors = [
-        angle_deg(
-            up_direction(level_cameras(ARC, roll_deg=rng.normal(scale=2.0, size=6))), np.array([0, 0, 1])
-        )
+        angle_deg(up_of(level_cameras(ARC, roll_deg=rng.normal(scale=2.0, size=6))), np.array([0, 0, 1]))
         for _ in range(50)
     ]
     assert np.median(errors) < 2.0
@@ -138,37 +145,37 @@ def test_a_hand_that_shakes_moves_up_little() -> None:
 
 def test_one_camera_alone_is_taken_as_level() -> None:
     (pose,) = level_cameras(replace(ARC, num_views=1, elevation_deg=0.0))
-    np.testing.assert_allclose(up_direction(pose[None]), [0, 0, 1], atol=2e-3)
+    np.testing.assert_allclose(up_of(pose[None]), [0, 0, 1], atol=2e-3)
 
 
 def test_straight_down_is_from_above() -> None:
     poses = np.stack([np.eye(4)] * 4)
     for pose, turn in zip(poses, np.radians([0, 90, 180, 270]), strict=True):
         pose[:2, :2] = [[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]]
-    np.testing.assert_allclose(up_direction(poses), [0, 0, 1], atol=1e-9)
-    assert np.isfinite(upright_from_solved(poses, np.zeros(3), 1.0)).all()
+    np.testing.assert_allclose(up_of(poses), [0, 0, 1], atol=1e-9)
+    assert np.isfinite(placed_upright(poses, np.zeros(3), 1.0)).all()
 
 
 def test_the_lowest_points_stand_on_the_floor() -> None:
     rng = np.random.default_rng(0)
     points = CENTRE + rng.uniform(-0.5, 0.5, size=(5000, 3))
     far = CENTRE - [0, 0, 50.0] + rng.normal(size=(500, 3))
-    upright = upright_from_solved(level_cameras(ARC), CENTRE, 1.0, points=np.concatenate([points, far]))
+    upright = placed_upright(level_cameras(ARC), CENTRE, 1.0, points=np.concatenate([points, far]))
     heights = points @ upright[2, :3] + upright[2, 3]
     assert np.quantile(heights, 0.02) == pytest.approx(0.0, abs=1e-9)
-    few = upright_from_solved(level_cameras(ARC), CENTRE, 1.0, points=points[:10])
-    np.testing.assert_allclose(few, upright_from_solved(level_cameras(ARC), CENTRE, 1.0))
+    few = placed_upright(level_cameras(ARC), CENTRE, 1.0, points=points[:10])
+    np.testing.assert_allclose(few, placed_upright(level_cameras(ARC), CENTRE, 1.0))
 
 
 def test_unusable_cameras_are_refused() -> None:
-    poses = level_cameras(ARC)
+    poses, up = level_cameras(ARC), np.array([0.0, 0.0, 1.0])
     with pytest.raises(ValueError, match="no usable cameras"):
-        upright_from_solved(poses[:0], CENTRE, 1.0)
+        upright_from_solved(poses[:0], CENTRE, 1.0, up=up)
     with pytest.raises(ValueError, match="no usable cameras"):
-        upright_from_solved(np.full((2, 4, 4), np.nan), CENTRE, 1.0)
+        upright_from_solved(np.full((2, 4, 4), np.nan), CENTRE, 1.0, up=up)
     for radius in (0.0, -1.0, np.nan, np.inf):
         with pytest.raises(ValueError, match="not usable"):
-            upright_from_solved(poses, CENTRE, radius)
+            upright_from_solved(poses, CENTRE, radius, up=up)
 
 
 def placed_empty(rng: np.random.Generator, scale: tuple[float, float, float]) -> Array:

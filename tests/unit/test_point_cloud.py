@@ -73,12 +73,50 @@ def test_points_that_say_nothing_are_left_out_and_counted() -> None:
     ]
 
 
+@pytest.mark.parametrize("stray", [1e7, 1e30, 1e99])
+def test_a_point_far_away_does_not_make_a_plane_of_a_cloud(stray: float) -> None:
+    """By the plain principal axes it does."""
+    points = some_points()
+    points[7] = stray, -stray, stray
+    assert clean_cloud(points, None).decisions == ()
+    sizes = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
+    assert sizes[2] < 1e-6 * sizes[0]
+    points[:, 2] = 3 * points[:, 0] - points[:, 1] + 5
+    with pytest.raises(ReconstructionError, match="one plane"):
+        clean_cloud(points, None)
+
+
+@pytest.mark.parametrize("wrong", [np.nan, np.inf, -np.inf, 1e200, -1e308])
+def test_points_that_can_not_be_reckoned_with_are_left_out_and_counted(wrong: float) -> None:
+    points = some_points()
+    points[[3, 50], [0, 2]] = wrong
+    cloud = clean_cloud(points, points)
+    np.testing.assert_array_equal(cloud.positions, np.delete(some_points(), [3, 50], axis=0))
+    assert ("points that are not finite", "2 of 100 left out") in [
+        (d.what, d.choice) for d in cloud.decisions
+    ]
+    with pytest.raises(ReconstructionError, match="0 different points with finite coordinates"):
+        clean_cloud(np.full((100, 3), wrong), None)
+
+
 def test_normals_without_length_or_number_are_none() -> None:
     normals = some_points()
-    normals[0], normals[1] = 0, np.nan
+    normals[0], normals[1], normals[2, 1] = 0, np.nan, np.inf
     cloud = clean_cloud(some_points(), normals)
     assert cloud.normals is not None
-    np.testing.assert_allclose(np.linalg.norm(cloud.normals, axis=1), [0, 0, *[1] * 98])
+    np.testing.assert_allclose(np.linalg.norm(cloud.normals, axis=1), [0, 0, 0, *[1] * 97])
+    assert [(d.what, d.choice) for d in cloud.decisions] == [
+        ("normals that are not finite", "2 of 100 left out")
+    ]
+
+
+@pytest.mark.parametrize("scale", [1e-200, 1.0, 1e200])
+def test_normals_of_any_length_are_made_unit(scale: float) -> None:
+    """By the plain norm those of 1e-200 stay as they are, and those of 1e200 become 0."""
+    expected = some_points() / np.linalg.norm(some_points(), axis=1, keepdims=True)
+    normals = clean_cloud(some_points(), scale * some_points()).normals
+    assert normals is not None
+    np.testing.assert_allclose(normals, expected)
 
 
 def test_clouds_that_can_not_be_used(tmp_path: Path) -> None:

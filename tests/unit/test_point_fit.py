@@ -1,6 +1,9 @@
 """Shapes that are known, given back from points on them that are noisy, strayed, flipped or few."""
 
+import itertools
+from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -8,12 +11,15 @@ import torch
 import trimesh
 
 from backend.errors import Cancelled, ErrorCode, ReconstructionError
+from backend.point_methods import PointMethod
 from backend.scene import SurfaceMesh, no_progress
+from backend.stages import point_network
 from backend.stages.mesh import MeshConfig
 from backend.stages.point_cloud import PointCloud, clean_cloud
 from backend.stages.point_fit import PointFitConfig, fit_points
 from backend.stages.point_mesh import mesh_of_points
-from backend.stages.point_network import METHODS, NetworkConfig
+from backend.stages.point_network import METHODS, NetworkConfig, PointNetwork, Queries
+from backend.stages.safe_steps import PATIENCE, SafeSteps
 
 CPU = torch.device("cpu")
 QUICK = PointFitConfig(
@@ -126,11 +132,64 @@ def test_normals_flipped_at_random_are_noticed() -> None:
 
 
 @pytest.mark.parametrize("method", sorted(METHODS))
-def test_each_network_finds_the_sphere(method: str) -> None:
+def test_each_network_finds_the_sphere(method: PointMethod) -> None:
     """They begin as a ball elsewhere and of half the size."""
     mesh = fitted(clean_cloud(sphere(500, 0.01), None), replace(QUICK, method=method))
     assert closed(mesh).euler_number == 2
     assert off_sphere(mesh).mean() < 0.03
+
+
+class PlainSteps(SafeSteps):
+    """The optimiser's own steps, whatever they lead to."""
+
+    def take(self, loss: torch.Tensor, length: float = 1.0) -> None:
+        self._optimiser.zero_grad()
+        torch.autograd.backward(loss)
+        self._optimiser.step()
+
+
+def plant_nans(monkeypatch: pytest.MonkeyPatch, method: PointMethod, wrong: Callable[[int], bool]) -> None:
+    """A query is no number in the steps that `wrong` says, counted from 0."""
+    step_loss, steps = METHODS[method], itertools.count()
+
+    def spoiled(network: PointNetwork, batch: Queries, *others: Any) -> torch.Tensor:
+        if wrong(next(steps)):
+            positions = batch.positions.clone()
+            positions[3, 1] = torch.nan
+            batch = replace(batch, positions=positions)
+        return step_loss(network, batch, *others)
+
+    monkeypatch.setitem(METHODS, method, spoiled)
+
+
+@pytest.mark.parametrize("method", [PointMethod.LINEAR, *sorted(METHODS)])
+def test_steps_that_are_not_finite_are_taken_back_and_told(
+    method: PointMethod, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Two of them; by plain steps the first one leaves nothing but NaN."""
+    cloud, config = clean_cloud(sphere(500, 0.01), None), replace(QUICK, method=method)
+    pulled = PointMethod.NEURAL_PULL if method == PointMethod.LINEAR else method
+    steps = (QUICK.sides if method == PointMethod.LINEAR else QUICK.network).steps
+    plant_nans(monkeypatch, pulled, (37, 250).__contains__)
+    mesh = fitted(cloud, config)
+    assert closed(mesh).euler_number == 2
+    assert off_sphere(mesh).mean() < 0.03
+    (told,) = (d for d in mesh.decisions if d.choice == f"{steps} steps")
+    assert "2 steps led to numbers that are not finite, were taken back and shortened" in told.because
+
+    monkeypatch.undo()
+    plant_nans(monkeypatch, pulled, (37).__eq__)
+    monkeypatch.setattr(point_network, "SafeSteps", PlainSteps)
+    few = {name: replace(getattr(config, name), steps=40) for name in ("sides", "network")}
+    with pytest.raises(ReconstructionError, match="No surface was found"):
+        fitted(cloud, replace(config, nodes=24, **few))
+
+
+def test_steps_none_of_which_is_finite_are_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    plant_nans(monkeypatch, PointMethod.NEURAL_PULL, lambda _: True)
+    with pytest.raises(ReconstructionError, match=f"{PATIENCE} steps were not finite") as caught:
+        fitted(clean_cloud(sphere(100, 0.0), None))
+    assert caught.value.code == ErrorCode.NO_SURFACE
 
 
 def test_the_same_seed_gives_the_same_surface_and_scale_does_not_matter() -> None:
@@ -153,7 +212,7 @@ def test_known_normals_that_are_not_there() -> None:
     with pytest.raises(ReconstructionError) as caught:
         fitted(cloud, replace(QUICK, normals_known=True))
     assert caught.value.code == ErrorCode.CLOUD_UNUSABLE
-    assert "--normals-known" in caught.value.remedy
+    assert "Do not say that they are known" in caught.value.remedy
 
 
 def test_a_fit_is_cancelled_between_two_steps() -> None:

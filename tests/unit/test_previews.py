@@ -10,7 +10,7 @@ from backend.mesh_files import read_mesh
 from backend.previews import Previews
 from backend.scene import Region, SurfacePoints, to_unit_sphere
 from backend.stages.mesh import PREVIEW_FACES, preview_mesh
-from backend.stages.train import Surface
+from backend.stages.surface import Surface
 from backend.workspace import Workspace
 
 CENTRE, HALF = np.array([3.0, -1.0, 2.0]), 2.0

@@ -18,14 +18,14 @@ from backend.stages.radiance_field import Radiance, RadianceField, RadianceShape
 from backend.stages.radiance_fit import RadianceConfig, fit_radiance
 from backend.stages.radiance_image import RadianceImage, radiance_image
 from backend.stages.stereo import unmatched
-from backend.stages.train import Surface
+from backend.stages.surface import Surface
 from tests.synthetic_scene import Scene, diagonal, photographed, ring_cameras, surface_distance, true_region
 
 CPU = torch.device("cpu")
 SHAPE = RadianceShape(
-    width=32, layers=2, frequencies=5, proposal_width=16, proposal_intervals=24, intervals=12
+    width=64, layers=3, frequencies=5, proposal_width=16, proposal_intervals=24, intervals=12
 )
-CONFIG = RadianceConfig(shape=SHAPE, steps=600, rays=96, nodes=40)
+CONFIG = RadianceConfig(shape=SHAPE, steps=1000, rays=96, nodes=40)
 
 
 @cache
@@ -83,13 +83,19 @@ def untrained() -> Radiance:
 
 
 def test_a_view_that_was_held_out_is_foretold() -> None:
-    """Nearly as well as by a body of the true outline and mean colour; untrained fields come nowhere near."""
+    """Better than by the true outline in its mean colour, which tells nothing of the texture.
+
+    The true picture blurred by two pixels is 2 dB better than that, the photographs to either side are 5 dB
+    worse. With half of the width and 600 steps a field is 0.3 dB worse, and its texture correlates by 0.18.
+    """
     view, covered = scene().views[-1], scene().coverage[-1]
     flat = np.where(covered[..., None], view.image_srgb[covered].mean(axis=0), 0)
     flat_db = psnr(view.image_srgb, flat, np.ones_like(covered))
     assert flat_db is not None
     assert held_out_psnr_db(untrained()) < flat_db - 5
-    assert held_out_psnr_db(surface().radiance) > flat_db - 1
+    assert held_out_psnr_db(surface().radiance) > flat_db + 1
+    seen = picture(surface().radiance).colour_srgb[covered].ravel()
+    assert np.corrcoef(seen, view.image_srgb[covered].ravel())[0, 1] > 0.5
 
 
 def test_where_the_masks_say_so_nothing_is_left() -> None:

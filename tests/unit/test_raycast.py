@@ -13,7 +13,6 @@ from backend.maths.geometry import pinhole_in_object, pixel_centres, ray_directi
 from backend.maths.raycast import (
     RayCaster,
     camera_rays,
-    cast_rays,
     intersect_planes,
     render_mesh,
     visible_from,
@@ -78,7 +77,7 @@ def test_first_hits_match_the_definition(scale: float, shift: float) -> None:
     origins = rng.normal(size=(200, 3)) * 2 * scale + shift
     directions = rng.normal(size=(200, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    hits = cast_rays(vertices, faces, origins, directions)
+    hits = RayCaster(vertices, faces).cast(origins, directions)
     expected = [first_hit_one_by_one(vertices[faces], o, d) for o, d in zip(origins, directions, strict=True)]
     assert 20 < sum(index >= 0 for _, index, _ in expected) < 180
     np.testing.assert_array_equal(hits.face, [index for _, index, _ in expected])
@@ -91,7 +90,7 @@ def test_hit_points_are_where_the_ray_says() -> None:
     mesh, camera = sphere_mesh(3, radius=2.0, centre=(10.0, -7.0, 3.0)), camera_at(np.array([0.0, -9.0, 2.0]))
     origins, directions = camera_rays(camera)
     origins = origins + np.array([10.0, -7.0, 3.0])
-    hits = cast_rays(mesh.vertices, mesh.faces, origins, directions)
+    hits = RayCaster(mesh.vertices, mesh.faces).cast(origins, directions)
     at = hits.hit
     assert at.sum() > 300
     by_corners = np.einsum("hk,hkd->hd", hits.barycentric[at], mesh.vertices[mesh.faces[hits.face[at]]])
@@ -108,7 +107,7 @@ def test_rays_at_edges_do_not_leak() -> None:
     edges = np.concatenate([mesh.faces[:, list(pair)] for pair in pairwise((0, 1, 2, 0))])
     for targets, tolerated in ((mesh.vertices[edges].mean(1), 0.0), (mesh.vertices, 0.01)):
         directions = targets / np.linalg.norm(targets, axis=1, keepdims=True)
-        hits = cast_rays(mesh.vertices, mesh.faces, np.zeros_like(directions), directions)
+        hits = RayCaster(mesh.vertices, mesh.faces).cast(np.zeros_like(directions), directions)
         assert (~hits.hit).mean() <= tolerated
 
 

@@ -10,7 +10,7 @@ import pytest
 import trimesh
 
 from backend.commands import rehearsed_files
-from backend.mesh_files import read_mesh, write_mesh, write_sparse
+from backend.mesh_files import read_mesh, read_sparse, write_mesh, write_sparse
 from backend.scene import no_progress
 from backend.stages.nerfstudio import camera_from_world, read_frames
 from backend.stages.report import ReportConfig, build_report, mesh_facts, report_numbers
@@ -37,7 +37,11 @@ def test_the_mesh_is_to_the_byte_what_a_run_would_write(folder: Path) -> None:
 
 def test_sparse_points_too(folder: Path) -> None:
     mesh = read_mesh(folder / "mesh.ply")
-    write_sparse(folder / "again.ply", positions=mesh.vertices, colours_srgb=mesh.colours_srgb)
+    positions, visibility = read_sparse(folder / "sparse.ply", num_photos=3)
+    assert visibility.shape == (4, 3)
+    assert visibility.all()
+    what = {"positions": positions, "colours_srgb": mesh.colours_srgb, "visibility": visibility}
+    write_sparse(folder / "again.ply", **what)
     assert (folder / "again.ply").read_bytes() == (folder / "sparse.ply").read_bytes()
 
 

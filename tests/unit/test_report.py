@@ -16,6 +16,7 @@ from PIL import Image
 from backend.benchmark import measuring
 from backend.errors import Cancelled, ErrorCode, ReconstructionError
 from backend.maths.raycast import MeshImage, render_mesh
+from backend.maths.upright import up_direction
 from backend.report_page import pictures
 from backend.report_page.wording import (
     count_text,
@@ -466,18 +467,31 @@ def test_turntable_cameras_hold_the_mesh_from_new_sides_with_its_top_up() -> Non
 def test_up_is_found_from_tilted_level_cameras(azimuths: tuple[float, ...]) -> None:
     """Each looks down by 30 degrees, so that no picture's own up is up. The world turned, up turns."""
     cameras = [camera_at(azimuth, 4 * np.tan(np.pi / 6)) for azimuth in azimuths]
-    np.testing.assert_allclose(pictures.up_direction(cameras), [0, 0, 1], atol=0.12)
+    np.testing.assert_allclose(pictures.up_of(cameras), [0, 0, 1], atol=0.12)
     turn = np.eye(4)
     turn[:3, :3] = trimesh.transformations.rotation_matrix(2.0, [1, 2, 3])[:3, :3]
     turned = [replace(camera, camera_from_world=camera.camera_from_world @ turn.T) for camera in cameras]
-    expected = turn[:3, :3] @ pictures.up_direction(cameras)
-    np.testing.assert_allclose(pictures.up_direction(turned), expected, atol=1e-9)
+    expected = turn[:3, :3] @ pictures.up_of(cameras)
+    np.testing.assert_allclose(pictures.up_of(turned), expected, atol=1e-9)
 
 
 def test_up_of_a_single_photograph_is_its_own() -> None:
     camera = camera_at(0.7, 2.0)
     expected = -camera.camera_from_world[1, :3]
-    np.testing.assert_allclose(pictures.up_direction([camera]), expected, atol=1e-9)
+    # But for a thousandth of backwards, which decides for cameras that look straight down.
+    np.testing.assert_allclose(pictures.up_of([camera]), expected, atol=2e-3)
+
+
+def test_the_report_is_upright_as_blender_is_though_a_photograph_was_taken_on_its_side() -> None:
+    """The plain eigenvector of the x axes would tilt by 20 degrees and more."""
+    cameras = [camera_at(azimuth, 1.5) for azimuth in (-0.6, -0.2, 0.2, 0.6)]
+    quarter = trimesh.transformations.rotation_matrix(np.pi / 2, [0, 0, 1])
+    cameras[1] = replace(cameras[1], camera_from_world=quarter @ cameras[1].camera_from_world)
+    up = pictures.up_of(cameras)
+    assert np.degrees(np.arccos(up[2])) < 1.0
+    axes = np.stack([np.linalg.inv(camera.camera_from_world)[:3, :3] for camera in cameras])
+    rights, bottoms, forwards = np.moveaxis(axes, 2, 0)
+    np.testing.assert_array_equal(up_direction(rights, -bottoms, -forwards).round(9), up.round(9))
 
 
 def test_turntable_views_are_between_the_photographs_side_and_the_others() -> None:

@@ -197,6 +197,7 @@ def test_without_silhouettes_nothing_is_tried(monkeypatch: pytest.MonkeyPatch) -
 
     monkeypatch.setattr(unseen_depth, "fit_level", tried)
     assert depth_behind(scene, LinearConfig())[0] == explained_radius(scene)
+    assert depth_behind(seen([-20.0, 0.0, 20.0], -0.9), LinearConfig(ball=0.3))[0] == 0.3
 
 
 def test_rounds_end_where_the_surface_comes_to_rest(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -11,8 +11,8 @@ from scipy.ndimage import distance_transform_edt, gaussian_filter
 from backend.errors import Cancelled, ErrorCode, ReconstructionError
 from backend.maths.geometry import pinhole_in_object
 from backend.maths.raycast import camera_rays
-from backend.scene import Camera, Region, View, no_progress, transform_points
-from backend.stages.stereo import StereoResult, match_views
+from backend.scene import Camera, Region, StereoResult, View, no_progress, transform_points
+from backend.stages.stereo import match_views
 from backend.stages.stereo_config import StereoConfig
 from backend.stages.stereo_windows import views_between
 from tests.synthetic_scene import (

@@ -16,11 +16,21 @@ from scipy.spatial import cKDTree
 
 from backend.errors import Cancelled
 from backend.maths.raycast import render_mesh
-from backend.scene import Decision, Progress, Region, SurfaceMesh, no_progress, transform_points, within
+from backend.scene import (
+    Decision,
+    Progress,
+    Region,
+    StereoResult,
+    SurfaceMesh,
+    no_progress,
+    transform_points,
+    within,
+)
 from backend.stages.mesh import MeshConfig, extract_mesh, level_set, preview_mesh
-from backend.stages.stereo import StereoResult, match_views
+from backend.stages.stereo import match_views
 from backend.stages.stereo_config import StereoConfig
-from backend.stages.train import ShowSurface, Surface, TrainConfig, fit_surface, show_nothing
+from backend.stages.surface import ShowSurface, Surface, show_nothing
+from backend.stages.train import TrainConfig, fit_surface
 from tests.synthetic_scene import (
     CENTRE,
     SIZE,

@@ -4,10 +4,12 @@ from dataclasses import replace
 from functools import cache
 
 import numpy as np
+import pytest
 
 from backend.maths.raycast import RayCaster, visible_from
 from backend.maths.srgb import linear_from_srgb, srgb_from_linear
 from backend.scene import Decision, View
+from backend.stages import vertex_colours
 from backend.stages.vertex_colours import colour_vertices
 from tests.synthetic_scene import arc_cameras, photographed, texture_srgb, true_mesh, true_normals
 
@@ -32,13 +34,15 @@ def exposed(views: tuple[View, ...], stops: np.ndarray) -> tuple[View, ...]:
     )
 
 
-def coloured(views: tuple[View, ...]) -> tuple[np.ndarray, np.ndarray, Decision]:
+def coloured(
+    views: tuple[View, ...], *, exposures_evened: bool = True
+) -> tuple[np.ndarray, np.ndarray, Decision]:
     """Colours (0 to 1) of the vertices that are seen, where they are, and the decision."""
     mesh = true_mesh()
     vertices, normals = np.asarray(mesh.vertices), true_normals(np.asarray(mesh.vertices))
     caster = RayCaster(vertices, np.asarray(mesh.faces))
     seen = visible_from(vertices, normals, [view.camera for view in views], caster)
-    colours, decision = colour_vertices(vertices, normals, seen, views)
+    colours, decision = colour_vertices(vertices, normals, seen, views, exposures_evened=exposures_evened)
     return colours[seen.any(axis=1)] / 255.0, vertices[seen.any(axis=1)], decision
 
 
@@ -55,6 +59,22 @@ def test_exposure_and_white_balance_make_no_seams() -> None:
     assert decision.choice == "brought to the mean of all"
     assert f"up to {np.abs(STOPS - STOPS.mean(axis=0)).max():.2f} stops" in decision.because
     assert np.abs(colours - common).mean() < 0.01
+
+
+def test_fewer_vertices_decide_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+    views = exposed(body_views(), STOPS)
+    _, _, by_all = coloured(views)
+    monkeypatch.setattr(vertex_colours, "_MOST_VERTICES", 500)
+    _, _, by_some = coloured(views)
+    assert by_some.choice == by_all.choice == "brought to the mean of all"
+    assert by_some.because != by_all.because  # it is from others
+
+
+def test_where_it_is_not_asked_for_photographs_stay_as_exposed() -> None:
+    views = exposed(body_views(), STOPS)
+    colours, _, decision = coloured(views, exposures_evened=False)
+    assert (decision.choice, decision.because) == ("left as it is", "the preset")
+    assert np.abs(colours - coloured(views)[0]).mean() > 0.01
 
 
 def test_photographs_of_something_else_are_not_brought_together() -> None:

@@ -15,7 +15,7 @@ from jaxtyping import Float32
 
 from backend.errors import ErrorCode, ReconstructionError
 from backend.records import RecordUnreadable, load_record, read_note, save_record
-from backend.workspace import StageCost, check_free_space, fingerprint, open_workspace
+from backend.workspace import Purpose, StageCost, check_free_space, fingerprint, open_workspace
 
 COST = StageCost(seconds=1.5, peak_memory_bytes=2**30)
 on_disk = settings(deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
@@ -264,6 +264,83 @@ def test_what_an_earlier_run_left_and_this_one_has_not_is_removed(tmp_path: Path
         assert (workspace.folder / "a").read_text() == "new a"
 
 
+@pytest.mark.parametrize("stuck", ["b", "c"])
+def test_a_result_that_is_open_elsewhere_leaves_all_as_they_were(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stuck: str
+) -> None:
+    """As on Windows, where nobody may replace or remove a file that another program has open."""
+    replace = Path.replace
+
+    def refuse(path: Path, target: Path) -> Path:
+        if path == tmp_path / "out" / stuck:
+            raise PermissionError(13, "Permission denied")
+        return replace(path, target)
+
+    with open_workspace(tmp_path / "out") as workspace:
+        workspace.write_results({name: write_text(f"old {name}") for name in "abc"}, frame="old")
+        monkeypatch.setattr(Path, "replace", refuse)
+        new = {name: write_text(f"new {name}") for name in "xab"}
+        with pytest.raises(ReconstructionError) as raised:
+            workspace.write_results(new, replaced=("c",), frame="new")
+        assert raised.value.code is ErrorCode.OUTPUT_UNUSABLE
+        assert f"the program that has {stuck} open" in raised.value.remedy
+        assert {path.name: path.read_text() for path in (tmp_path / "out").glob("?")} == {
+            name: f"old {name}" for name in "abc"
+        }
+        assert workspace.frame == "old"
+        monkeypatch.setattr(Path, "replace", replace)
+        workspace.write_results(new, replaced=("c",), frame="new")
+        assert {path.name: path.read_text() for path in (tmp_path / "out").glob("?")} == {
+            name: f"new {name}" for name in "xab"
+        }
+        assert workspace.frame == "new"
+        assert not list(workspace.private.glob("*/"))
+
+
+def test_a_checkpoint_that_can_not_be_written_is_told(tmp_path: Path) -> None:
+    with open_workspace(tmp_path / "out") as workspace:
+        (workspace.private / "photos.npz.part").mkdir()
+        with pytest.raises(ReconstructionError, match="cannot be written"):
+            workspace.save("photos", "abc", outer(), Outer, COST)
+
+
+def test_a_folder_stays_with_its_photographs(tmp_path: Path) -> None:
+    """With one of them at least: who adds, drops or retouches some goes on in the same folder."""
+    with open_workspace(tmp_path / "out") as workspace:
+        workspace.claim("photographs", ["1", "2", "3"])
+        workspace.claim("photographs", ["3", "4"])
+    with open_workspace(tmp_path / "out") as workspace:
+        for others in (["1", "2"], ["5"]):  # those of before last are forgotten
+            with pytest.raises(ReconstructionError, match="other photographs") as raised:
+                workspace.claim("photographs", others)
+            assert raised.value.code is ErrorCode.OUTPUT_UNUSABLE
+        workspace.claim("photographs", ["4"])
+
+
+@pytest.mark.parametrize(
+    ("first", "then", "words"),
+    [
+        ("photographs", "points", "a reconstruction from photographs"),
+        ("points", "photographs", "a surface that was fitted to points"),
+        ("pictures", "photographs", "pictures of a finished job"),
+    ],
+)
+def test_a_folder_keeps_its_purpose(tmp_path: Path, first: Purpose, then: Purpose, words: str) -> None:
+    with open_workspace(tmp_path / "out") as workspace:
+        workspace.claim(first)
+        workspace.claim(first)
+    with open_workspace(tmp_path / "out") as workspace, pytest.raises(ReconstructionError, match=words):
+        workspace.claim(then)
+
+
+def test_checkpoints_without_a_purpose_are_those_of_photographs(tmp_path: Path) -> None:
+    with open_workspace(tmp_path / "out") as workspace:
+        workspace.save("photos", "abc", outer(), Outer, COST)
+        with pytest.raises(ReconstructionError, match="from photographs"):
+            workspace.claim("points")
+        workspace.claim("photographs", ["1"])
+
+
 def test_a_run_that_did_nothing_leaves_nothing(tmp_path: Path) -> None:
     with open_workspace(tmp_path / "out") as workspace:
         workspace.log_path.write_text("log")
@@ -299,6 +376,15 @@ def test_the_fingerprint_follows_content_names_and_settings(tmp_path: Path) -> N
     second = fingerprint(folder, "x", 1)
     file.rename(tmp_path / "b.png")
     assert len({first, second, fingerprint(folder, "x", 1)}) == 3
+
+
+def test_what_file_browsers_leave_is_not_in_the_fingerprint(tmp_path: Path) -> None:
+    (tmp_path / "a.png").write_bytes(b"1")
+    first = fingerprint(tmp_path)
+    (tmp_path / ".DS_Store").write_bytes(b"where windows were")
+    assert fingerprint(tmp_path) == first
+    (tmp_path / "b.png").write_bytes(b"1")
+    assert fingerprint(tmp_path) != first
 
 
 def test_the_scratch_folder_is_empty_each_time(tmp_path: Path) -> None:

@@ -1,0 +1,62 @@
+"""Which files are photographs, and what each is called in results; standard library only.
+
+The backend names photographs by it, and who shows its results finds them again.
+"""
+
+from collections.abc import Sequence
+from pathlib import Path, PurePosixPath
+
+SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp")
+"""Of files that can be read, in small letters."""
+_OTHER_SUFFIXES = frozenset(
+    {".heic", ".heif", ".avif", ".jxl", ".jp2", ".gif", ".exr", ".hdr", ".psd"}
+    | {".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2"}
+)
+"""Of pictures that cannot: phones and cameras write some of them beside those above."""
+
+
+def photographs_in(folder: Path) -> list[Path]:
+    """The photographs right in the folder. Raises OSError where it cannot be read."""
+    return [path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES and _is_visible_file(path)]
+
+
+def passed_over(sources: Sequence[Path]) -> tuple[str, ...]:
+    """Names of the pictures among the sources, files or folders, that cannot be read.
+
+    Raises OSError where a folder cannot be read.
+    """
+    members = (path for source in sources for path in (source.iterdir() if source.is_dir() else [source]))
+    found = (path for path in members if path.suffix.lower() in _OTHER_SUFFIXES and _is_visible_file(path))
+    return tuple(sorted({path.name for path in found}))
+
+
+def passed_over_text(names: Sequence[str]) -> str:
+    """What to tell the user of pictures that were passed over; empty where there are none."""
+    if not names:
+        return ""
+    shown = ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
+    return (
+        f"Passed over, because only JPEG, PNG, TIFF, WebP and BMP can be read: {shown}. Convert them to JPEG."
+    )
+
+
+def names_of(paths: Sequence[Path]) -> list[str]:
+    """What photographs are called: the file's name, after as many folders as tell it from the others."""
+    all_parts = [path.absolute().parts for path in paths]
+    names = []
+    for parts in all_parts:
+        length = 1
+        while sum(other[-length:] == parts[-length:] for other in all_parts) > 1 and length < len(parts):
+            length += 1
+        names.append(PurePosixPath(*parts[-length:]).as_posix())
+    return names
+
+
+def is_named(path: Path, name: str) -> bool:
+    """Whether a photograph in this file may be called so: whether its path ends in the name."""
+    parts = PurePosixPath(name).parts
+    return bool(parts) and path.parts[-len(parts) :] == parts
+
+
+def _is_visible_file(path: Path) -> bool:
+    return not path.name.startswith(".") and path.is_file()

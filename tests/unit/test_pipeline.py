@@ -1,0 +1,203 @@
+"""What a run makes of its photographs' files and of an earlier run's folder, before and between stages."""
+
+import inspect
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from backend import pipeline, workspace
+from backend.errors import Cancelled, ErrorCode, ReconstructionError
+from backend.pipeline import Job, Listener, Stages
+from backend.presets import PRESETS
+from backend.records import load_record
+from backend.scene import Photo
+from backend.workspace import StageCost, open_workspace
+
+SETTINGS = PRESETS["fast"]
+
+
+class Quiet:
+    """A listener that remembers which stages were finished before."""
+
+    def __init__(self) -> None:
+        self.kept: tuple[str, ...] = ()
+
+    def resumed(self, stages: tuple[str, ...]) -> None:
+        self.kept = stages
+
+    def stage_started(self, name: str, index: int, count: int) -> None: ...
+
+    def progressed(self, fraction: float, text: str) -> None: ...
+
+    def stage_finished(self, cost: StageCost) -> None: ...
+
+    def previewed(self, path: Path) -> None: ...
+
+    def warned(self, text: str) -> None: ...
+
+
+@pytest.fixture(autouse=True)
+def _among_other_tests(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Torch stays as it is, and so do hints: the checks of arguments take `tuple[Photo, ...]` for no type."""
+    monkeypatch.setattr(pipeline, "set_up_torch", lambda _: None)
+    monkeypatch.setattr(workspace, "load_record", inspect.unwrap(load_record))
+
+
+@pytest.fixture
+def photos(tmp_path: Path) -> Path:
+    return make_photos(tmp_path / "photos", 0)
+
+
+def make_photos(folder: Path, first: int) -> Path:
+    """Three, named alike in every folder."""
+    folder.mkdir()
+    for index in range(3):
+        grey = np.full((4, 6, 3), 20 * (first + index), np.uint8)
+        Image.fromarray(grey).save(folder / f"{index}.png")
+    return folder
+
+
+def up_to_the_cameras(job: Job, listener: Listener | None = None) -> tuple[Photo, ...]:
+    """Run until cameras are asked for, and stop there; the photographs that they would be found for."""
+    given: list[tuple[Photo, ...]] = []
+
+    def solve_cameras(photos: tuple[Photo, ...], *_: Any, **__: Any) -> Any:
+        given.append(photos)
+        raise Cancelled
+
+    solve_cameras.__annotations__["return"] = pipeline.SolvedCameras
+    with open_workspace(job.output) as opened, pytest.raises(Cancelled):
+        pipeline.run(
+            job,
+            opened,
+            settings=SETTINGS,
+            stages=Stages(solve_cameras=solve_cameras),
+            listener=listener or Quiet(),
+        )
+    return given[0]
+
+
+def job_of(images: Path, **changes: Any) -> Job:
+    return Job(images=(images,), output=images.parent / "out", device="cpu", **changes)
+
+
+def kept_after(job: Job, change: Callable[[], object]) -> tuple[str, ...]:
+    """Which stages a second run need not do again."""
+    up_to_the_cameras(job)
+    change()
+    listener = Quiet()
+    up_to_the_cameras(job, listener)
+    return listener.kept
+
+
+def test_photographs_that_were_moved_are_read_from_where_they_are(photos: Path) -> None:
+    """Cameras read them once more where they were made smaller."""
+    up_to_the_cameras(job_of(photos))
+    moved = photos.rename(photos.with_name("moved"))
+    listener = Quiet()
+    found = up_to_the_cameras(job_of(moved), listener)
+    assert listener.kept == ("photos",)
+    assert [photo.path for photo in found] == [moved / f"{index}.png" for index in range(3)]
+
+
+def test_what_is_no_photograph_does_not_count(photos: Path, tmp_path: Path) -> None:
+    """Neither for what is kept nor for the space that is needed; nor masks of other photographs."""
+    masks = make_photos(tmp_path / "masks", 5)
+
+    def open_in_a_file_browser() -> None:
+        for name in (".DS_Store", "clip.mov", "0.xmp", "._0.png"):
+            (photos / name).write_bytes(b"no photograph")
+        (masks / "of another.png").write_bytes(b"never read")
+
+    assert kept_after(job_of(photos, masks=masks), open_in_a_file_browser) == ("photos",)
+
+
+@pytest.mark.parametrize("name", ["photos/1.png", "masks/1.png"])
+def test_a_photograph_or_mask_that_changed_is_read_again(photos: Path, tmp_path: Path, name: str) -> None:
+    masks = make_photos(tmp_path / "masks", 5)
+    change = np.full((4, 6, 3), 222, np.uint8)
+    assert not kept_after(job_of(photos, masks=masks), lambda: Image.fromarray(change).save(tmp_path / name))
+
+
+def test_masks_that_are_no_longer_given_are_forgotten(photos: Path, tmp_path: Path) -> None:
+    masks = make_photos(tmp_path / "masks", 5)
+    up_to_the_cameras(job_of(photos, masks=masks))
+    assert all(photo.mask is None for photo in up_to_the_cameras(job_of(photos)))
+
+
+def test_a_finished_job_is_not_replaced_by_another_shoot(photos: Path, tmp_path: Path) -> None:
+    """Photographs are told apart by what is in them: cameras begin to count at the same number each time."""
+    up_to_the_cameras(job_of(photos))
+    kept = (tmp_path / "out/.fewview/photos.npz").read_bytes()
+    with pytest.raises(ReconstructionError, match="other photographs") as raised:
+        up_to_the_cameras(job_of(make_photos(tmp_path / "others", 3)))
+    assert raised.value.code is ErrorCode.OUTPUT_UNUSABLE
+    assert (tmp_path / "out/.fewview/photos.npz").read_bytes() == kept
+
+
+def test_a_photograph_that_nobody_may_read_is_told(photos: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(path: Path) -> str:
+        raise PermissionError(13, "Permission denied", str(path))
+
+    monkeypatch.setattr(pipeline, "content_of", refuse)
+    with pytest.raises(ReconstructionError, match=r"0\.png cannot be read") as raised:
+        up_to_the_cameras(job_of(photos))
+    assert raised.value.code is ErrorCode.PHOTO_UNREADABLE
+
+
+def test_a_surface_from_points_is_not_replaced(photos: Path, tmp_path: Path) -> None:
+    with open_workspace(tmp_path / "out") as opened:
+        opened.claim("points")
+        opened.write_results({"mesh.ply": lambda path: path.write_text("a mesh")})
+    with pytest.raises(ReconstructionError, match="fitted to points"):
+        up_to_the_cameras(job_of(photos))
+    assert (tmp_path / "out/mesh.ply").read_text() == "a mesh"
+
+
+def test_one_photograph_more_goes_into_the_same_folder(photos: Path) -> None:
+    """As the program advises where there were too few."""
+    up_to_the_cameras(job_of(photos))
+    Image.fromarray(np.full((4, 6, 3), 222, np.uint8)).save(photos / "3.png")
+    assert len(up_to_the_cameras(job_of(photos))) == 4
+
+
+def test_space_is_asked_for_by_photographs_their_size_and_what_is_to_come(
+    photos: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[int] = []
+    monkeypatch.setattr(
+        pipeline, "check_free_space", lambda _folder, needed_bytes: asked.append(needed_bytes)
+    )
+
+    def more_files() -> None:
+        for index in range(50):
+            (photos / f"{index}.xmp").touch()
+
+    kept_after(job_of(photos), more_files)
+    all_stages = pipeline.STAGE_NAMES
+    first, second = asked
+    assert first == pipeline._needed_bytes(3, all_stages, SETTINGS)
+    assert second == pipeline._needed_bytes(3, all_stages[1:], SETTINGS) < first
+    assert first < pipeline._needed_bytes(3, all_stages, PRESETS["detailed"])
+    assert pipeline._needed_bytes(20, ("report",), SETTINGS) == pipeline._BYTES_FOR_RESULTS
+
+
+@pytest.mark.parametrize(("seed", "fits"), [(0, True), (1, False)])
+def test_cameras_do_not_come_to_stand_beside_a_mesh_of_others(photos: Path, seed: int, fits: bool) -> None:
+    job = job_of(photos, until="cameras")
+    with open_workspace(job.output) as opened:
+        files = pipeline._files(job)
+        frame = pipeline.stage_fingerprints(job, files, SETTINGS, "cpu")["cameras"]
+        opened.claim("photographs", files.photo_contents.values())
+        opened.write_results({"mesh.ply": lambda path: path.write_text("a mesh")}, frame=frame)
+    job = job_of(photos, until="cameras", seed=seed)
+    if fits:
+        up_to_the_cameras(job)
+        return
+    with pytest.raises(ReconstructionError, match="would not fit it") as raised:
+        up_to_the_cameras(job)
+    assert raised.value.code is ErrorCode.OUTPUT_UNUSABLE
