@@ -187,6 +187,10 @@ class Region:
         """Radius of the sphere, world units."""
         return float(np.cbrt(np.linalg.det(self.world_from_object[:3, :3])))
 
+    def part(self, part_from_object: Float64[np.ndarray, "4 4"]) -> "Region":
+        """The sphere that a similarity maps from the object frame to the unit sphere of its own."""
+        return Region(object_from_world=part_from_object @ self.object_from_world)
+
 
 @dataclass(frozen=True, kw_only=True)
 class SurfacePoints:

@@ -18,7 +18,7 @@ def field_surface(distance: DistanceFunction, region: Region, nodes: int, device
 
     Raises ReconstructionError(NO_SURFACE) if there is no inside.
     """
-    frame = tight_frame(on_grid(distance, region, region, COARSEST, device), region)
+    frame = region.part(tight_frame(on_grid(distance, region, region, COARSEST, device)))
     return surface_in(distance, region, frame, nodes, device)
 
 

@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float32, Shaped
+from jaxtyping import Float, Float32, Float64, Shaped
 from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 
@@ -65,15 +65,22 @@ def measurements(
     )
 
 
-def carried(scene: Measurements, views: tuple[View, ...], region: Region, frame: Region) -> Measurements:
-    """The measurements of the views in the region's object frame, in another frame."""
+def carried(
+    scene: Measurements,
+    views: tuple[View, ...],
+    region: Region,
+    frame_from_object: Float64[np.ndarray, "4 4"],
+) -> Measurements:
+    """The measurements of the views in the region's object frame, in a frame without rotation against it.
+
+    Where the world's origin is, far off perhaps, has no part in how points are carried.
+    """
     device = scene.positions.device
-    frame_from_object = frame.object_from_world @ region.world_from_object
-    scale = region.radius_world / frame.radius_world
+    scale = float(frame_from_object[0, 0])
     middle = torch.tensor(frame_from_object[:3, 3], dtype=torch.float32, device=device)
     return replace(
         scene,
-        cameras=[pinhole_in_object(view.camera, frame, device) for view in views],
+        cameras=[pinhole_in_object(view.camera, region.part(frame_from_object), device) for view in views],
         depths=[depth * scale for depth in scene.depths],
         positions=scene.positions * scale + middle,
         region_centre=middle,

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from ..errors import ErrorCode, ReconstructionError
 from ..maths.grid import spacing
-from ..scene import Decision, Region, to_unit_sphere
+from ..scene import Decision, to_unit_sphere
 from .radiance_field import Radiance
 
 COARSEST = 48
@@ -43,8 +43,8 @@ def show_nothing(_surface: Surface) -> None:
     """A callback for those who do not want to look at unfinished surfaces."""
 
 
-def tight_frame(distance: Float[Tensor, "nodes nodes nodes"], region: Region) -> Region:
-    """The cube around the inside of a coarse field, as the unit cube of a frame of its own.
+def tight_frame(distance: Float[Tensor, "nodes nodes nodes"]) -> Float64[np.ndarray, "4 4"]:
+    """frame_from_object: the cube around the inside of a coarse field becomes the unit cube of its own frame.
 
     Raises ReconstructionError(NO_SURFACE) if there is no inside.
     """
@@ -59,5 +59,4 @@ def tight_frame(distance: Float[Tensor, "nodes nodes nodes"], region: Region) ->
     low, high = inside.amin(dim=0), inside.amax(dim=0)
     half = float((high - low).max()) / 2 + 2.5 * cell
     centre = ((low + high) / 2).cpu().double().numpy()
-    frame_from_object = to_unit_sphere(centre, half)
-    return Region(object_from_world=frame_from_object @ region.object_from_world)
+    return to_unit_sphere(centre, half)

@@ -62,9 +62,10 @@ def fit_surface(
         radius, depth = depth_behind(scene, config.linear)
         began_s = clock()
         distance = fit_level(scene, start(scene, radius, COARSEST), radius, config.rounds[0], config.linear)
-        frame = tight_frame(distance, region)
+        frame_from_object = tight_frame(distance)
+        frame = region.part(frame_from_object)
         costs = [GridCost(nodes=COARSEST, seconds=clock() - began_s)]
-        scene = carried(scene, views, region, frame)
+        scene = carried(scene, views, region, frame_from_object)
         distance = start(scene, radius, config.levels[0])
     total = sum(config.steps) + 10 * len(config.levels)
     done, rendered, taken_back = 0, 0, 0

@@ -142,8 +142,8 @@ WORLDS = pytest.mark.parametrize(("scale", "shift"), [(1e-4, 0.0), (1e5, 0.0), (
 def test_the_result_is_the_same_in_any_world(scale: float, shift: float) -> None:
     """Region, depths, field and mesh up to the similarity, to 1e-4 of the subject's size; simplified as well.
 
-    The field gets its input to 1e-9. A point that this moves into the next cube of merged ones moves the
-    nodes around by more, up to 1e-4 of the cube.
+    A point that the last digit moves into the next cube of merged ones moves the nodes around it by up to
+    1e-4 of the cube; so points come to the field's frame by numbers in which the world's origin has no part.
     """
     offset = np.array([shift, -shift, shift])
     solved = moved(small_scene(), scale, offset)

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from backend.errors import ErrorCode, ReconstructionError
 from backend.maths.grid import interpolate, locate
-from backend.scene import Decision, Region, StereoResult, View, no_progress, transform_points
+from backend.scene import Decision, StereoResult, View, no_progress, transform_points
 from backend.stages import field_surface, neus_fit, radiance_fit
 from backend.stages.deadline import deadline_after
 from backend.stages.measurements import carried, measurements
@@ -64,8 +64,9 @@ def linear() -> Surface:
 
 
 def rendered(views: tuple[View, ...], steps: int, seed: int = 0, config: RenderConfig = FEW) -> Refined:
-    frame = Region(object_from_world=linear().grid_from_world)
-    measured = carried(measurements(views, true_region(), stereo(), CPU), views, true_region(), frame)
+    frame_from_object = linear().grid_from_world @ true_region().world_from_object
+    in_object = measurements(views, true_region(), stereo(), CPU)
+    measured = carried(in_object, views, true_region(), frame_from_object)
     chance = torch.Generator().manual_seed(seed)
     never = deadline_after(None, time.perf_counter)
     return refine(measured, torch.from_numpy(linear().distance), steps, config, chance, no_progress, never)
