@@ -6,7 +6,14 @@ from ..scene import Decision
 from .linear_fit import LinearConfig, fit_level, start
 from .measurements import Measurements
 from .silhouettes import least_distance, missing, silhouette_rays, uncontradicted
-from .unseen_side import DEEPEST, depth_is_bounded, explained_radius, is_all_around, widest_view_angle_deg
+from .unseen_side import (
+    DEEPEST,
+    depth_is_bounded,
+    explained_radius,
+    is_all_around,
+    seen_depth,
+    widest_view_angle_deg,
+)
 
 _NODES = 48
 _ROUNDS = 6
@@ -24,12 +31,15 @@ def depth_behind(scene: Measurements, config: LinearConfig) -> tuple[float, Deci
     """Radius of the ball behind, in half widths of the subject, and what decided it."""
     if config.ball is not None:
         return config.ball, _decision(config.ball, "the preset")
-    explained = explained_radius(scene)
-    radius = _met_radius(scene, explained, config)
+    explained, seen = explained_radius(scene), seen_depth(scene)
+    met = _met_radius(scene, explained, config)
+    radius = max(met, seen)
     angle_deg = widest_view_angle_deg(scene)
     because = f"the photographs are taken from sides up to {angle_deg:.0f} degrees apart"
-    if radius > explained:
+    if met == radius > explained:
         because += f"; with the {explained:.2f} that measured points ask for, silhouettes were missed"
+    elif radius > explained:
+        because += "; so deep is what was measured, and no less is assumed of the other side"
     elif not is_all_around(scene):
         because += "; so turn the normals of the measured points"
     return radius, _decision(radius, because)

@@ -1,5 +1,6 @@
 """What is assumed of the side that no photograph shows: a ball behind what was measured."""
 
+import numpy as np
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float
@@ -16,6 +17,8 @@ LEAST_BOUNDED_RADIUS = 0.5
 """The same where silhouettes bound the depth: they cut a ball that is too deep, one too small stays."""
 DEEPEST = 1.4
 """The same, at most: as deep as the subject is across its diagonal."""
+_MOST = (0.02, 0.98)
+"""Of the points, between these shares."""
 
 
 def ball_behind(scene: Measurements, radius: float, nodes: int) -> Float[Tensor, "nodes nodes nodes"]:
@@ -44,6 +47,20 @@ def explained_radius(scene: Measurements) -> float:
     least = LEAST_RADIUS + depth_is_bounded(scene) * (LEAST_BOUNDED_RADIUS - LEAST_RADIUS)
     explained = min(max(turning, least), 1.0)
     return explained + is_all_around(scene) * (1 - explained)
+
+
+def seen_depth(scene: Measurements) -> float:
+    """From front to back of what was measured, half of it, in half widths of the subject; at most 1.
+
+    Along the points' mean normal, without the nearest and the farthest fiftieth. 0 where silhouettes bound
+    the depth, for then points lie on more sides than one.
+    """
+    if not len(scene.positions):
+        return 0.0
+    along = scene.positions @ F.normalize(_mean(scene, scene.normals), dim=0)
+    farthest, nearest = np.quantile(along.cpu().numpy(), _MOST)
+    half = float(nearest - farthest) / 2 / _half_width(scene, _mean(scene, scene.positions))
+    return (1 - depth_is_bounded(scene)) * min(half, 1.0)
 
 
 def _mean(scene: Measurements, values: Float[Tensor, "points 3"]) -> Float[Tensor, "3"]:

@@ -1,6 +1,7 @@
 """Capsules before cameras: where silhouettes let them be, which rays miss a field, and how deep they are."""
 
 import math
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -20,7 +21,7 @@ from backend.stages.linear_fit import LinearConfig
 from backend.stages.measurements import Measurements
 from backend.stages.silhouettes import inside_along, least_distance, middles, missing, silhouette_rays
 from backend.stages.unseen_depth import depth_behind
-from backend.stages.unseen_side import DEEPEST, ball_behind, explained_radius
+from backend.stages.unseen_side import DEEPEST, ball_behind, explained_radius, seen_depth
 
 CPU = torch.device("cpu")
 SIZE = 160
@@ -174,6 +175,34 @@ def test_the_ball_behind_grows_with_what_only_silhouettes_show(measured_from: fl
     assert 1.5 * short < long <= DEEPEST
     assert "silhouettes were missed" not in why_short.because
     assert "silhouettes were missed" in why_long.because
+
+
+def reaching(azimuths_deg: list[float], depth: float) -> Measurements:
+    """The capsule's silhouettes; what was measured looks along x, and reaches so far along it."""
+    scene = seen(azimuths_deg, -0.5)
+    along = torch.linspace(0.0, depth, 1001)[:, None] * torch.eye(3)[0]
+    normals = torch.eye(3)[:1].expand_as(along)
+    return replace(scene, positions=along, normals=normals, colours=along, confidence=along[:, 0] + 1)
+
+
+def test_the_other_side_is_as_deep_as_what_was_measured(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Half of 0.96 of the depth, in widths of a capsule; where silhouettes bound the depth they tell."""
+    azimuths = [-20.0, 0.0, 20.0]
+    for depth in (0.1, 0.3):
+        half_widths = seen_depth(reaching(azimuths, depth)) / (0.48 * depth)
+        assert 1 / half_widths == pytest.approx(0.5, rel=0.2), "from 20 degrees, half as wide as it is long"
+    assert seen_depth(reaching(azimuths, 0.3)) == pytest.approx(
+        3 * seen_depth(reaching(azimuths, 0.1)), rel=0.3
+    )
+    assert seen_depth(reaching([-50.0, 0.0, 50.0], 0.3)) == 0.0
+    monkeypatch.setattr(unseen_depth, "_met_radius", lambda _scene, explained, _config: explained)
+    radius, why = depth_behind(reaching(azimuths, 0.5), LinearConfig())
+    assert radius == seen_depth(reaching(azimuths, 0.5)) > explained_radius(reaching(azimuths, 0.5))
+    assert "so deep is what was measured" in why.because
+    nothing = torch.zeros((0, 3))
+    none = {"positions": nothing, "normals": nothing, "colours": nothing, "confidence": nothing[:, 0]}
+    without = replace(reaching(azimuths, 0.3), **none)
+    assert seen_depth(without) == 0.0
 
 
 def test_half_around_the_points_tell_the_radius_and_all_around_it_is_the_widest() -> None:
