@@ -25,7 +25,7 @@ from .measurements import Measurements, measurements
 from .networks import NetworkConfig, NeuralSurface
 from .neus_losses import Moment, Sampling, Weights, measured_points, point_loss, ray_loss
 from .pixels import pixels_of_unit_sphere
-from .safe_steps import SafeSteps
+from .safe_steps import OTHER_PHOTOS, SafeSteps
 from .surface import COARSEST, ShowSurface, Surface, show_nothing
 
 _SOFTEST, _SHARPEST = math.log(10.0), math.log(2048.0)
@@ -109,7 +109,7 @@ def fit_neus(
     sampled = GridCost(nodes=COARSEST, seconds=clock() - began_s)
     learning = replace(deadline, at_s=deadline.at_s - predicted_s([sampled], config.nodes))
     steps = _learn(model, scene, config, generator, progress, learning, lambda distance: show(look(distance)))
-    steps.raise_if_nothing_was_learned()
+    steps.raise_if_nothing_was_learned("the photographs", OTHER_PHOTOS)
     progress(1.0, f"sampling the distance on {config.nodes}^3")
     distance = model.distance(active_levels(config.network, 1.0))
     surface = field_surface(distance, region, config.nodes, device)

@@ -23,6 +23,7 @@ from ..point_methods import PointMethod
 from ..scene import Decision, Progress, to_unit_sphere, transform_points, within
 from .point_cloud import PointCloud
 from .point_network import LearnedField, NetworkConfig, fit_network
+from .safe_steps import not_finite
 from .surface import Surface
 
 _LEFT_OUT = 5
@@ -282,8 +283,7 @@ def _of_learning(what: str, config: NetworkConfig, learned: LearnedField) -> Dec
     """How many steps a network took, and whether all of them went well."""
     because = "the method's setting"
     if learned.taken_back:
-        numbers = f"{learned.taken_back} steps led to numbers that are not finite"
-        because += f"; {numbers}, were taken back and shortened"
+        because += f"; {not_finite(learned.taken_back)}, were taken back and shortened"
     return _decision(what, f"{config.steps} steps", because)
 
 

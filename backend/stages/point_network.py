@@ -14,7 +14,6 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn.functional import softplus
 
-from ..errors import ErrorCode, ReconstructionError
 from ..maths.grid import node_positions
 from ..maths.losses import entropy_of_side, log_mean_exp, newton_pull, pull, worst_offset
 from ..maths.nearest import nearest_tree
@@ -140,11 +139,8 @@ def fit_network(
         loss = step_loss(network, batch, balance, step / config.steps, config, generator)
         safe.take(loss, _rate(step, config))
         if safe.hopeless:
-            raise ReconstructionError(
-                ErrorCode.NO_SURFACE,
-                f"Nothing could be learned from the points: {safe.taken_back} steps were not finite.",
-                "Check that they lie on a surface; try another method.",
-            )
+            break
+    safe.raise_if_nothing_was_learned("the points", "Check that they lie on a surface; try another method.")
     with torch.no_grad():
         places = (
             node_positions(nodes, points.device).reshape(-1, 3).tensor_split(-(-(nodes**3) // _NODES_AT_ONCE))

@@ -23,7 +23,7 @@ from .field_surface import field_surface
 from .measurements import Measurements, measurements
 from .pixels import Pixels, pixels_of_unit_sphere, rays_through
 from .radiance_field import RadianceField, RadianceShape, RaySamples, kept, sample_rays
-from .safe_steps import SafeSteps
+from .safe_steps import OTHER_PHOTOS, SafeSteps
 from .surface import COARSEST, ShowSurface, Surface, show_nothing
 
 _FIRST_RATE, _LAST_RATE = 1e-2, 1e-3
@@ -93,7 +93,7 @@ def fit_radiance(
         grown = min(1.0, (safe.steps + 1) / _WARM_UP_STEPS)
         safe.take(loss, grown * (_LAST_RATE / _FIRST_RATE) ** done)
         done = max(safe.steps / config.steps, steps_end.share_gone(began_s))
-    safe.raise_if_nothing_was_learned()
+    safe.raise_if_nothing_was_learned("the photographs", OTHER_PHOTOS)
     radiance.open_waves(1.0)
     progress(0.95, "density on a grid")
     level = _level(radiance, scene, pixels)

@@ -6,8 +6,15 @@ from torch import Tensor
 
 from ..errors import ErrorCode, ReconstructionError
 
+OTHER_PHOTOS = "Check that the photographs open in a viewer, or use another preset."
+"""What to do where photographs teach nothing."""
 PATIENCE = 5
 """Steps that may be taken back before it is better to stop: the last ones were a sixteenth as long."""
+
+
+def not_finite(taken_back: int) -> str:
+    """What a report says of so many steps."""
+    return f"{taken_back} steps led to numbers that are not finite"
 
 
 class SafeSteps:
@@ -37,14 +44,13 @@ class SafeSteps:
         n = self.taken_back
         return f", {n} of which {'was' if n == 1 else 'were'} not finite and taken back" if n else ""
 
-    def raise_if_nothing_was_learned(self) -> None:
+    def raise_if_nothing_was_learned(self, source: str, remedy: str) -> None:
         """ReconstructionError(NO_SURFACE) where there is no hope, or no step was a good one."""
-        if self.hopeless or self.taken_back == self.steps:
+        if self.hopeless or 0 < self.steps == self.taken_back:
             raise ReconstructionError(
                 ErrorCode.NO_SURFACE,
-                "Nothing could be learned from the photographs: "
-                f"{self.taken_back} of {self.steps} steps gave numbers that are not finite.",
-                "Check that the photographs open in a viewer, or use another preset.",
+                f"Nothing could be learned from {source}: {not_finite(self.taken_back)}.",
+                remedy,
             )
 
     def keep(self) -> None:

@@ -17,6 +17,7 @@ from .deadline import Clock, GridCost, deadline_after, finest_grid, predicted_s
 from .linear_fit import LinearConfig, fit_level, start
 from .measurements import Measurements, carried, measurements
 from .render_fit import RenderConfig, refine
+from .safe_steps import not_finite
 from .surface import COARSEST, ShowSurface, Surface, show_nothing, tight_frame
 from .unseen_depth import depth_behind
 
@@ -147,7 +148,7 @@ def _of_rendering(config: TrainConfig, rendered: int, taken_back: int) -> Decisi
     what, because = "refinement by rendering", _who_asked(config, rendered == sum(config.steps))
     if not taken_back:
         return Decision(what=what, choice=f"{rendered} steps" if rendered else "left out", because=because)
-    numbers = f"{taken_back} steps led to numbers that are not finite"
+    numbers = not_finite(taken_back)
     if not rendered:
         return Decision(what=what, choice="left out", because=f"{numbers}; so the field before them stands")
     because += f"; {numbers}, were taken back and shortened"

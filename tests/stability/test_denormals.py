@@ -33,33 +33,38 @@ import torch
 from torch import nn
 from backend.machine import set_up_torch
 
-def seconds(work):
+def processor_s(work):
     times = []
     for _ in range(5):
-        began_s = time.perf_counter()
+        began_s = time.thread_time()
         work()
-        times.append(time.perf_counter() - began_s)
+        times.append(time.thread_time() - began_s)
     return min(times)
 
-torch.manual_seed(0)
-hidden = [nn.Linear(64, 64), nn.Softplus(beta=100), nn.Linear(64, 64), nn.Softplus(beta=100)]
-network, points = nn.Sequential(*hidden, nn.Linear(64, 1)), torch.randn(16_384, 64)
-faint, sound = torch.full((1_000_000,), 1e-39), torch.ones(1_000_000)
+def backward_s(beta):
+    torch.manual_seed(0)
+    hidden = [nn.Linear(64, 64), nn.Softplus(beta=beta), nn.Linear(64, 64), nn.Softplus(beta=beta)]
+    network, points = nn.Sequential(*hidden, nn.Linear(64, 1)), torch.randn(16_384, 64)
+    return processor_s(lambda: network(points).sum().backward())
+
 torch.set_num_threads(1)
-product = seconds(lambda: faint * 0.5) / seconds(lambda: sound * 0.5)
-kept = seconds(lambda: network(points).sum().backward())
+gentle, kept = backward_s(1), backward_s(100)
 set_up_torch(torch.device("cpu"))
 torch.set_num_threads(1)
-print(product, kept / seconds(lambda: network(points).sum().backward()))
+print(kept / gentle, kept / backward_s(100))
 """
 
 
 @pytest.mark.slow
-def test_a_network_of_softplus_is_several_times_faster() -> None:
-    """NeuS's, whose softplus is so steep (100) that derivatives of many of its units are denormal."""
+def test_denormal_numbers_cost_a_network_of_softplus_nothing() -> None:
+    """NeuS's, whose softplus is so steep (100) that derivatives of many of its units are denormal.
+
+    How much they cost where they are kept is told beside a gentle softplus, which has none. Some processors
+    hardly mind.
+    """
     command = [sys.executable, "-c", NETWORK]
     result = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=120, check=True)
-    product, network = map(float, result.stdout.split())
-    if product < 2:
-        pytest.skip(f"this processor is not slow with denormal numbers: {product:.1f} times as long")
-    assert network > 2
+    slower, regained = map(float, result.stdout.split())
+    if slower < 2:
+        pytest.skip(f"this processor is not slow with denormal numbers: {slower:.1f} times as long")
+    assert regained > slower / 2

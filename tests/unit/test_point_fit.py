@@ -187,7 +187,8 @@ def test_steps_that_are_not_finite_are_taken_back_and_told(
 
 def test_steps_none_of_which_is_finite_are_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
     plant_nans(monkeypatch, PointMethod.NEURAL_PULL, lambda _: True)
-    with pytest.raises(ReconstructionError, match=f"{PATIENCE} steps were not finite") as caught:
+    told = f"{PATIENCE} steps led to numbers that are not finite"
+    with pytest.raises(ReconstructionError, match=told) as caught:
         fitted(clean_cloud(sphere(100, 0.0), None))
     assert caught.value.code == ErrorCode.NO_SURFACE
 
