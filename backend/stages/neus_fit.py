@@ -12,6 +12,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import partial
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -103,7 +104,7 @@ def fit_neus(
     progress(0.0, "making networks")
     scene = measurements(views, region, stereo, device)
     model = _Model(config.network, generator).to(device)
-    look = partial(surface_in, region=region, frame=region, nodes=COARSEST, device=device)
+    look = partial(surface_in, region=region, frame_from_object=np.eye(4), nodes=COARSEST, device=device)
     began_s = clock()
     show(look(model.distance(active_levels(config.network, 1.0))))
     sampled = GridCost(nodes=COARSEST, seconds=clock() - began_s)

@@ -19,6 +19,9 @@ from bpy_extras.object_utils import world_to_camera_view  # noqa: E402
 from mathutils import Euler, Matrix, Vector  # noqa: E402
 
 pytestmark = [pytest.mark.blender, pytest.mark.usefixtures("addon")]
+needs_python = pytest.mark.skipif(
+    "FEWVIEW_PYTHON" not in os.environ, reason="FEWVIEW_PYTHON names no Python with it"
+)
 
 Part = Callable[[str], ModuleType]
 CORNERS = np.array([(1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1)], np.float64)
@@ -331,7 +334,7 @@ def test_it_does_not_wait_in_a_window_and_can_be_cancelled(
 
 
 @pytest.mark.slow
-@pytest.mark.skipif("FEWVIEW_PYTHON" not in os.environ, reason="FEWVIEW_PYTHON names no Python with it")
+@needs_python
 def test_pictures_show_the_result_where_blender_sees_it(result: Any, part: Part) -> None:
     """A tetrahedron's silhouette are its projected triangles, and a face's middle has its corners' mean."""
     render = bpy.context.scene.render
@@ -444,7 +447,7 @@ def blender_rays(made: Any) -> tuple[np.ndarray, np.ndarray]:
 
 
 @pytest.mark.slow
-@pytest.mark.skipif("FEWVIEW_PYTHON" not in os.environ, reason="FEWVIEW_PYTHON names no Python with it")
+@needs_python
 def test_a_radiance_field_is_seen_as_from_blenders_cameras(result: Any, tmp_path: Path) -> None:
     """Every pixel is what the field says of the ray that Blender sends through it."""
     render = bpy.context.scene.render

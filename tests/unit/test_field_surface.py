@@ -37,7 +37,7 @@ def test_the_grid_lies_tightly_around_the_inside_and_holds_the_distance() -> Non
 
 def test_what_lies_outside_the_unit_sphere_is_outside() -> None:
     """A function that says that all is inside: chance where no ray went."""
-    surface = surface_in(lambda points: torch.full((len(points),), -3.0), REGION, REGION, 9, CPU)
+    surface = surface_in(lambda points: torch.full((len(points),), -3.0), REGION, np.eye(4), 9, CPU)
     reach = node_positions(9, CPU).norm(dim=-1)
     torch.testing.assert_close(torch.tensor(surface.distance), reach - 1)
 
