@@ -1,10 +1,10 @@
 """Searching rays for the surface of a distance field."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 _TOGETHER = 8
@@ -66,41 +66,64 @@ def first_crossing(
     can be moved towards or away from it. Rays end `reach` after their start.
     """
     place, hit = start.clone(), torch.zeros_like(start, dtype=torch.bool)
-    number, end, infinite = torch.arange(len(start), device=start.device), start + reach, start + torch.inf
-    going, state = [origins, directions, end], [start, start, infinite, infinite, place, hit]
+    nowhere = start + torch.inf
+    rays = _Rays(
+        number=torch.arange(len(start), device=start.device),
+        origins=origins,
+        directions=directions,
+        end=start + reach,
+        along=start,
+        last=start,
+        before=nowhere,
+        nearest=nowhere,
+        at=place,
+        met=hit,
+    )
     for first in range(0, steps, _TOGETHER):
         for _ in range(first, min(first + _TOGETHER, steps)):
-            state = _traced(distance, shortest, longest, *going, *state)
-        _, last, _, _, at, met = state
-        place[number], hit[number] = at, met
-        left = ~met & (last < going[2])
-        number, going, state = number[left], [x[left] for x in going], [x[left] for x in state]
+            rays = _traced(rays, distance, shortest, longest)
+        place[rays.number], hit[rays.number] = rays.at, rays.met
+        left = ~rays.met & (rays.last < rays.end)
+        rays = _Rays(**{field.name: getattr(rays, field.name)[left] for field in fields(_Rays)})
     return Crossing(along=place, hit=hit)
 
 
-def _traced(
-    distance: DistanceFunction,
-    shortest: float,
-    longest: float,
-    origins: Float[Tensor, "rays 3"],
-    directions: Float[Tensor, "rays 3"],
-    end: Float[Tensor, "rays"],
-    along: Float[Tensor, "rays"],
-    last: Float[Tensor, "rays"],
-    before: Float[Tensor, "rays"],
-    nearest: Float[Tensor, "rays"],
-    at: Float[Tensor, "rays"],
-    met: Bool[Tensor, "rays"],
-) -> list[Tensor]:
-    """One step of rays that are at `along`: the same of what changes, from `along` to `met`.
+@dataclass(frozen=True, kw_only=True)
+class _Rays:
+    """Rays on their way; lengths are distances from their origins."""
 
-    `last` is the place before, `before` the distance there, `at` where a ray met the surface or was nearest.
-    """
-    here = distance(origins + along[:, None] * directions)
-    closer = (here < nearest) & ~met
-    nearest, at = torch.where(closer, here, nearest), torch.where(closer, along, at)
-    new = (here <= 0) & ~met
+    number: Int64[Tensor, "rays"]
+    """Among all that were asked for."""
+    origins: Float[Tensor, "rays 3"]
+    directions: Float[Tensor, "rays 3"]
+    end: Float[Tensor, "rays"]
+    along: Float[Tensor, "rays"]
+    """Where they look next."""
+    last: Float[Tensor, "rays"]
+    """Where they looked before."""
+    before: Float[Tensor, "rays"]
+    """The field there."""
+    nearest: Float[Tensor, "rays"]
+    """The least of it so far."""
+    at: Float[Tensor, "rays"]
+    """Where they met the surface, or were nearest to it."""
+    met: Bool[Tensor, "rays"]
+
+
+def _traced(rays: _Rays, distance: DistanceFunction, shortest: float, longest: float) -> _Rays:
+    """The same rays after one step."""
+    along, last, before = rays.along, rays.last, rays.before
+    here = distance(rays.origins + along[:, None] * rays.directions)
+    closer = (here < rays.nearest) & ~rays.met
+    new = (here <= 0) & ~rays.met
     share = torch.where(before.isfinite(), before / (before - here).clamp(min=1e-9), 1.0)
-    at = torch.where(new, last + share * (along - last), at)
-    further = (along + (0.95 * here).clamp(shortest, longest)).minimum(end)
-    return [further, along, here, nearest, at, met | new]
+    at = torch.where(closer, along, rays.at)
+    return replace(
+        rays,
+        along=(along + (0.95 * here).clamp(shortest, longest)).minimum(rays.end),
+        last=along,
+        before=here,
+        nearest=torch.where(closer, here, rays.nearest),
+        at=torch.where(new, last + share * (along - last), at),
+        met=rays.met | new,
+    )
