@@ -49,9 +49,9 @@ class NetworkConfig:
     """NAP: radius in which the worst query is looked for, in spreads of the queries."""
     draws: int = 5
     """SDRO: queries around each query."""
-    jitter: float = 1.0
+    jitter: float = 1 / 23
     """SDRO: their spread, in spreads of the queries."""
-    temperature: float = 2.0
+    temperature: float = 66 / 23
     """SDRO: of the soft maximum over the draws, in spreads of the queries."""
     robust_share: float = 0.2
     """SDRO: of the robust loss; the rest is Neural-Pull's."""
