@@ -1,6 +1,7 @@
 """Depth maps in the making: swept where images are small, then refined and grown, finer and finer."""
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -34,6 +35,8 @@ from .stereo_windows import Window, views_between
 
 _LEAST_FOR_A_PLANE = 12
 """Seeds in a window that make its plane worth continuing."""
+_FARTHEST = 0.02
+"""Of the inverse depth at the region's end: nothing farther off moves between photographs."""
 _LARGEST_STEP_PX = 2.0
 """Of the match, from a pixel to the next, on one surface: a limit of its gradient (Burt & Julesz 1980).
 
@@ -49,6 +52,8 @@ class Map:
     window: Window
     inverse_depth: Float[Tensor, "height width"]
     score: Float[Tensor, "height width"]
+    behind: Float[Tensor, "height width"]
+    """How well patches agree behind the region, where that was better than anything in it; else 0."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -153,8 +158,8 @@ def _grown(
     score, index = agreement(window, sources, hypotheses, asked).max(dim=0)
     better = asked & (score > current.score)
     chosen = hypotheses.gather(0, index[None])[0]
-    grown = Map(
-        window=window,
+    grown = replace(
+        current,
         inverse_depth=torch.where(better, chosen, current.inverse_depth),
         score=torch.where(better, score, current.score),
     )
@@ -172,17 +177,13 @@ def _sweep(window: Window, sources: list[Window], config: StereoConfig) -> Map:
     """Best plane of every pixel, after semi-global matching where asked for, to a fraction of a step."""
     if not sources:
         nothing = torch.zeros_like(window.grey)
-        return Map(window=window, inverse_depth=nothing, score=nothing)
+        return Map(window=window, inverse_depth=nothing, score=nothing, behind=nothing)
     near, far = _inverse_depth_range(window.camera)
     maps = [epipolar_map(source.camera, window.camera) for source in sources]
     step = min(float(_step_of_one_pixel(window, [m], (near + far) / 2).median()) for m in maps)
     count = int(np.clip(math.ceil((near - far) / step), 16, config.num_planes)) + 1
     planes = torch.linspace(far, near, count, device=window.grey.device)
-    chunks = [
-        agreement(window, sources, chunk[:, None, None].expand(-1, *window.grey.shape), window.subject)
-        for chunk in planes.tensor_split(math.ceil(count / 16))
-    ]
-    score = torch.cat(chunks)
+    score = torch.cat(list(_scores(window, sources, planes)))
     cost = (1 - score).permute(1, 2, 0).contiguous()
     if config.semi_global:
         gradient = window.grey.diff(dim=0, append=window.grey[-1:]).abs()
@@ -192,7 +193,23 @@ def _sweep(window: Window, sources: list[Window], config: StereoConfig) -> Map:
     index, offset = lowest_with_neighbours(cost)
     inverse_depth = planes[index] + offset * (planes[1] - planes[0])
     best = score.permute(1, 2, 0).gather(-1, index[..., None])[..., 0]
-    return Map(window=window, inverse_depth=inverse_depth, score=best)
+    behind = torch.zeros_like(best)
+    if window.surrounded:
+        # as many depths again: a pixel whose own is not among those tried agrees with another by chance
+        farther = far - (planes - far)[1:]
+        for scores in _scores(window, sources, farther[farther > _FARTHEST * far]):
+            behind = behind.maximum(scores.max(dim=0).values)
+        behind = torch.where(behind > score.max(dim=0).values, behind, 0.0)
+    return Map(window=window, inverse_depth=inverse_depth, score=best, behind=behind)
+
+
+def _scores(
+    window: Window, sources: list[Window], planes: Float[Tensor, "planes"]
+) -> Iterator[Float[Tensor, "some_planes height width"]]:
+    """How well patches agree at every pixel at each inverse depth, a few of them at a time."""
+    for some in planes.split(16):
+        hypotheses = some[:, None, None].expand(-1, *window.grey.shape)
+        yield agreement(window, sources, hypotheses, window.subject)
 
 
 def _inverse_depth_range(camera: Pinhole) -> tuple[float, float]:
@@ -235,7 +252,7 @@ def _refined(current: Map, sources: list[Window], steps_px: list[float], config:
         index, offset = lowest_with_neighbours(1 - score.permute(1, 2, 0))
         better = (middle + (index - 2 + offset) * step).clamp(far, near)
         # what no source sees is not moved
-        current = Map(window=window, inverse_depth=torch.where(best > -1, better, middle), score=best)
+        current = replace(current, inverse_depth=torch.where(best > -1, better, middle), score=best)
     return current
 
 
@@ -269,9 +286,9 @@ def _enlarged(current: Map, window: Window) -> Map:
     scale = pixels.new_tensor(
         [small.width / (window.camera.width // 2 * 2), small.height / (window.camera.height // 2 * 2)]
     )
-    both = torch.stack([current.inverse_depth, current.score])
-    inverse_depth, score = sample_image(both, (pixels * scale)[None])[0]
-    return Map(window=window, inverse_depth=inverse_depth, score=score)
+    all_ = torch.stack([current.inverse_depth, current.score, current.behind])
+    inverse_depth, score, behind = sample_image(all_, (pixels * scale)[None])[0]
+    return Map(window=window, inverse_depth=inverse_depth, score=score, behind=behind)
 
 
 def _measured(
@@ -336,5 +353,6 @@ def _votes(
                 confirmed |= said[between][0]
                 denied |= said[between][1]
         votes += agrees & (confirmed | ~denied)
-    good = own.window.subject & (own.score > config.min_correlation) & (points.norm(dim=-1) < 1.0)
+    enough = own.behind.clamp(min=config.min_correlation)
+    good = own.window.subject & (own.score > enough) & (points.norm(dim=-1) < 1.0)
     return torch.where(good & (votes > 1), votes, 0.0)

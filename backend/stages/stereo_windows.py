@@ -36,6 +36,8 @@ class Window:
     patches: PatchStatistics
     noise: float
     subject: Bool[Tensor, "height width"]
+    surrounded: bool
+    """Whether neither a mask nor an even backdrop parts the subject from what is around it."""
 
 
 def pyramid(view: View, region: Region, config: StereoConfig, device: torch.device) -> list[Window]:
@@ -44,6 +46,7 @@ def pyramid(view: View, region: Region, config: StereoConfig, device: torch.devi
     colours = torch.tensor(view.image_srgb, device=device).permute(2, 0, 1)
     image = colours.mean(dim=0)
     subject = sees_region(camera)
+    backdrop = None
     if view.mask is not None:
         subject &= torch.tensor(view.mask > 0.5, device=device)
     elif (backdrop := find_backdrop(colours, subject)) is not None:
@@ -69,6 +72,7 @@ def pyramid(view: View, region: Region, config: StereoConfig, device: torch.devi
                     patches=patch_statistics(flat, subject.float(), config.patch_radius),
                     noise=noise,
                     subject=subject,
+                    surrounded=view.mask is None and backdrop is None,
                 )
             )
         if is_last:
