@@ -330,7 +330,7 @@ def test_a_view_between_two_that_shows_nothing_does_not_contradict_them() -> Non
 
 
 def test_what_stands_behind_the_region_does_not_hang_in_it() -> None:
-    """Where only the region's depths are tried, 86 pixels of the wall find one; the body loses next to nothing."""
+    """Where only the region's depths are tried, 86 pixels of the wall find one; the body loses little."""
     scene = photographed(arc_cameras(4, 60, 160), wall=True)
     unmasked = tuple(replace(view, mask=None) for view in scene.views)
     errors = errors_percent(match(unmasked))
