@@ -207,8 +207,8 @@ def _scores(
     window: Window, sources: list[Window], planes: Float[Tensor, "planes"]
 ) -> Iterator[Float[Tensor, "some_planes height width"]]:
     """How well patches agree at every pixel at each inverse depth, a few of them at a time."""
-    for some in planes.split(16):
-        hypotheses = some[:, None, None].expand(-1, *window.grey.shape)
+    for first in range(0, len(planes), 16):
+        hypotheses = planes[first : first + 16, None, None].expand(-1, *window.grey.shape)
         yield agreement(window, sources, hypotheses, window.subject)
 
 

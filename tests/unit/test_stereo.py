@@ -12,9 +12,10 @@ from backend.errors import Cancelled, ErrorCode, ReconstructionError
 from backend.maths.geometry import pinhole_in_object
 from backend.maths.raycast import camera_rays
 from backend.scene import Camera, Region, StereoResult, View, no_progress, transform_points
+from backend.stages.depth_maps import depth_maps
 from backend.stages.stereo import match_views
 from backend.stages.stereo_config import StereoConfig
-from backend.stages.stereo_windows import views_between
+from backend.stages.stereo_windows import pyramid, views_between
 from tests.synthetic_scene import (
     CENTRE,
     OBJECT_UNIT,
@@ -336,6 +337,19 @@ def test_what_stands_behind_the_region_does_not_hang_in_it() -> None:
     errors = errors_percent(match(unmasked))
     assert (errors > 5).sum() < 30
     assert (errors < 1).sum() > 30_500
+
+
+def test_from_within_the_region_a_step_may_lead_beyond_all_that_moves() -> None:
+    """Sixteen steps from near to far are so long there that none is left behind: nothing to compare, no error."""
+    wide = np.eye(4)
+    wide[:3, :3] /= 8 * OBJECT_UNIT
+    wide[:3, 3] = -CENTRE / (8 * OBJECT_UNIT)
+    beside = arc_cameras(3, 1, 40)[::2]
+    views = [replace(view, mask=None) for view in photographed(beside, wall=True).views]
+    region, config = Region(object_from_world=wide), StereoConfig()
+    windows = [pyramid(view, region, config, torch.device("cpu"))[-1:] for view in views]
+    maps = depth_maps(windows, [[1], [0]], config, no_progress)
+    assert [float(sizes[0].map.behind.max()) for sizes in maps] == [0, 0]
 
 
 def test_views_between_are_about_on_the_way() -> None:
