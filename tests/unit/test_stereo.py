@@ -340,7 +340,7 @@ def test_what_stands_behind_the_region_does_not_hang_in_it() -> None:
 
 
 def test_from_within_the_region_a_step_may_lead_beyond_all_that_moves() -> None:
-    """Sixteen steps from near to far are so long there that none is left behind: nothing to compare, no error."""
+    """Sixteen steps from near to far are so long there that none is left behind: no error."""
     wide = np.eye(4)
     wide[:3, :3] /= 8 * OBJECT_UNIT
     wide[:3, 3] = -CENTRE / (8 * OBJECT_UNIT)
