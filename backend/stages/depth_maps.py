@@ -37,6 +37,8 @@ _LEAST_FOR_A_PLANE = 12
 """Seeds in a window that make its plane worth continuing."""
 _FARTHEST = 0.02
 """Of the inverse depth at the region's end: nothing farther off moves between photographs."""
+_AS_GOOD = 0.03
+"""Of the correlation: texture that repeats agrees as well behind the region as where it is."""
 _LARGEST_STEP_PX = 2.0
 """Of the match, from a pixel to the next, on one surface: a limit of its gradient (Burt & Julesz 1980).
 
@@ -353,6 +355,6 @@ def _votes(
                 confirmed |= said[between][0]
                 denied |= said[between][1]
         votes += agrees & (confirmed | ~denied)
-    enough = own.behind.clamp(min=config.min_correlation)
+    enough = (own.behind - _AS_GOOD).clamp(min=config.min_correlation)
     good = own.window.subject & (own.score > enough) & (points.norm(dim=-1) < 1.0)
     return torch.where(good & (votes > 1), votes, 0.0)
