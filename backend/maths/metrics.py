@@ -104,15 +104,21 @@ def surface_error(
     cameras: Sequence[Camera] | None,
     seed: int,
     num_samples: int = 200_000,
+    mesh_among: RayCaster | None = None,
+    truth_among: RayCaster | None = None,
 ) -> ErrorAgainstTruth:
-    """Error of a mesh with at least one face; repeats to the bit with the same seed."""
+    """Error of a mesh with at least one face; repeats to the bit with the same seed.
+
+    Where mesh and truth are parts of something, `mesh_among` and `truth_among` are all of it: what hides
+    them from the cameras.
+    """
     rng = np.random.default_rng(seed)
     of_mesh, face = _sample(mesh.vertices, mesh.faces, num_samples, rng)
     of_truth = _sample_truth(truth, num_samples, rng)
     visible, share_of_truth, share_of_mesh = None, None, None
     if cameras and truth.faces is not None:
-        seen_mesh = _seen(of_mesh, cameras, RayCaster(mesh.vertices, mesh.faces))
-        seen_truth = _seen(of_truth, cameras, RayCaster(truth.vertices, truth.faces))
+        seen_mesh = _seen(of_mesh, cameras, mesh_among or RayCaster(mesh.vertices, mesh.faces))
+        seen_truth = _seen(of_truth, cameras, truth_among or RayCaster(truth.vertices, truth.faces))
         share_of_mesh, share_of_truth = float(seen_mesh.mean()), float(seen_truth.mean())
         if seen_mesh.any() and seen_truth.any():
             visible, _ = _compare(of_mesh.where(seen_mesh), of_truth.where(seen_truth), truth.diagonal)

@@ -168,10 +168,11 @@ def build_report(inputs: ReportInputs, config: ReportConfig, *, progress: Progre
     drawn = mesh
     if truth is not None:
         progress((len(views) + 1) / (len(views) + 2), "measuring against the truth")
-        chance = {"seed": inputs.seed, "num_samples": config.error_samples}
-        error = surface_error(mesh, truth, cameras=[view.camera for view in views], **chance)
+        seed, num_samples = inputs.seed, config.error_samples
+        given = [view.camera for view in views]
+        error = surface_error(mesh, truth, cameras=given, seed=seed, num_samples=num_samples)
         # The error takes the place of the support, which is drawn in colours from 0 to 1.
-        distance = vertex_error_percent(mesh, truth, **chance)
+        distance = vertex_error_percent(mesh, truth, seed=seed, num_samples=num_samples)
         drawn = replace(mesh, support=distance / np.float32(ERROR_MAP_LIMIT_PERCENT))
     images = [render_mesh(drawn, camera, caster=caster) for camera in cameras]
     return Report(
