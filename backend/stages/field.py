@@ -57,6 +57,10 @@ class SurfaceField(nn.Module):
         rows = self.rows[index]
         return torch.where(rows >= 0, self.distances[rows.clamp(min=0)], self.frozen[index])
 
+    def change(self, index: Int[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+        """By how much the distances there differ from those that the field began with."""
+        return self.node_values(index) - self.frozen[index]
+
     def distance(self, corners: Corners) -> Float[Tensor, "points"]:
         """Signed distance."""
         return (self.node_values(corners.index) * corners.weight).sum(dim=-1)

@@ -162,7 +162,10 @@ def _point_loss(
 
 
 def _shape_loss(field: SurfaceField, generator: torch.Generator) -> Float[Tensor, ""]:
-    """Squared Laplacian at random nodes near the surface, in cells."""
+    """Squared Laplacian, at random nodes near the surface and in cells, of what the steps have changed.
+
+    Not of the field itself, which is as smooth as the points allow and would lose what they say of it.
+    """
     chosen = torch.randint(len(field.active), (8192,), generator=generator).to(field.active.device)
-    bent = laplacian_at(field.node_values, field.active[chosen], field.nodes)
-    return 0.5 * (bent / spacing(field.nodes)).square().mean()
+    bent = laplacian_at(field.change, field.active[chosen], field.nodes)
+    return 5.0 * (bent / spacing(field.nodes)).square().mean()

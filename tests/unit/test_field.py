@@ -65,6 +65,20 @@ def test_only_nodes_near_the_surface_are_learnt() -> None:
     )
 
 
+def test_how_it_began_is_no_change_however_bent() -> None:
+    """Only what was learnt since counts, and that reaches the parameters."""
+    field = make_field()
+    every = torch.arange(NODES**3)
+    assert not field.change(every).any()
+    with torch.no_grad():
+        field.distances.add_(0.25)
+    near = near_surface(ball(), 1).flatten()
+    torch.testing.assert_close(field.change(every), 0.25 * near.float())
+    torch.autograd.backward(field.change(every).sum())
+    assert field.distances.grad is not None
+    assert (field.distances.grad == 1).all()
+
+
 def test_the_grid_it_is_made_from_is_left_alone() -> None:
     grid = ball()
     field = SurfaceField(
