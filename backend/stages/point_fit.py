@@ -5,7 +5,7 @@ then fits the smoothest grid that agrees with the points' planes, as smooth as f
 were held out. The other methods are networks alone.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
@@ -15,7 +15,7 @@ from torch import Tensor
 
 from ..errors import ErrorCode, ReconstructionError
 from ..maths.evidence import merged_points, point_distances
-from ..maths.grid import locate, refined, spacing, value_and_gradient
+from ..maths.grid import interpolate, locate, refined, spacing, value_and_gradient
 from ..maths.neighbours import against_neighbours, neighbour_planes, trusts
 from ..maths.sides import Sides, sides_by_walking
 from ..maths.smooth_fit import fit_smooth
@@ -81,12 +81,12 @@ class _Points:
     signs_known: bool
 
     def where(self, kept: Tensor) -> "_Points":
-        return _Points(
+        return replace(
+            self,
             positions=self.positions[kept],
             trust=self.trust[kept],
             planes=self.planes[kept],
             flatness=self.flatness[kept],
-            signs_known=self.signs_known,
         )
 
 
@@ -195,6 +195,9 @@ def _fit_linear(
         sides = sides_by_walking(
             learned.distance, points.positions[known], points.planes[known], points.flatness[known].square()
         )
+        inwards = _share_inwards(points, sides) if points.signs_known else 0.0
+        if inwards > 0.5:
+            points = replace(points, planes=-points.planes)
         progress(0.6, "choosing the smoothness")
         held = torch.randperm(len(points.positions), generator=generator) % _LEFT_OUT == 0
         foretold = []
@@ -223,7 +226,19 @@ def _fit_linear(
                 f"more than {_MOST_FLIPPED:.0%} are against their neighbours'",
             )
         )
+    if inwards > 0.5:
+        made.append(_decision("normals", "all turned round", f"{inwards:.0%} point inwards"))
     return distance, made
+
+
+def _share_inwards(points: _Points, sides: Sides) -> float:
+    """Of the points, by trust: how many have more outside behind their normals than before them."""
+    nodes = len(sides.distance)
+    step = 2 * spacing(nodes) * points.planes
+    before, behind = (
+        interpolate(sides.distance, locate(points.positions + way * step, nodes)) for way in (1, -1)
+    )
+    return float((points.trust * (before < behind)).sum() / points.trust.sum())
 
 
 def _fit_levels(

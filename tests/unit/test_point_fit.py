@@ -112,6 +112,7 @@ def test_known_normals_are_met() -> None:
     closed(mesh)
     assert np.median(off_sphere(mesh)) < 0.005
     assert off_sphere(mesh).max() < 1 / 3
+    assert not any(d.what == "normals" for d in mesh.decisions)
 
 
 def test_half_of_the_points_are_strays() -> None:
@@ -129,6 +130,15 @@ def test_normals_flipped_at_random_are_noticed() -> None:
     closed(mesh)
     assert off_sphere(mesh).mean() < 0.01
     assert any(d.what == "normals" and "signs left out" in d.choice for d in mesh.decisions)
+
+
+def test_normals_that_all_point_inwards_are_turned_round() -> None:
+    """As of a scan of a mould, or of a mesh whose faces are inside out."""
+    points = sphere(1500, 0.0)
+    mesh = fitted(clean_cloud(points, CENTRE - points), replace(QUICK, normals_known=True))
+    closed(mesh)
+    assert off_sphere(mesh).mean() < 0.01
+    assert any(d.what == "normals" and "turned round" in d.choice for d in mesh.decisions)
 
 
 @pytest.mark.parametrize("method", sorted(METHODS))
