@@ -30,6 +30,7 @@ from .scene import Decision, Photo, Region, SolvedCameras, StereoResult, Surface
 from .stages.camera_refinement import match_solved, with_refined
 from .stages.camera_report import build_camera_report
 from .stages.cameras import solve_cameras
+from .stages.confirmation import unconfirmed
 from .stages.mesh import extract_mesh
 from .stages.neus_fit import NeusConfig, fit_neus
 from .stages.photos import load_photos, match_masks, named_photos
@@ -306,6 +307,8 @@ def _placed(
     solve = partial(stages.solve_cameras, photos, job.cameras, settings.cameras, **scratch)
     solved = this.stage("cameras", solve)
     _warn_of_unplaced(solved, len(photos), this)
+    if doubt := unconfirmed(solved):
+        this.warn(doubt)
     del photos, solve  # the views hold what is needed of them
     return solved, this.stage("region", partial(stages.find_region, solved, settings.region))
 

@@ -16,6 +16,7 @@ from ..maths.sampling import mean_colours
 from ..report_page.diagrams import Bar, histogram, match_graph, thumbnail, top_view
 from ..report_page.template import filled
 from ..scene import CameraEvidence, Region, SolvedCameras
+from .confirmation import unconfirmed
 
 WEAK_PAIR, STRONG_PAIR = 30, 100
 """Verified matches: with fewer than the first, a photograph is not placed by another at the first attempt;
@@ -111,7 +112,7 @@ def build_camera_report(
         median_angle_deg=median_angle_deg,
         median_error_px=float(np.median(seen_errors)) if len(seen_errors) else None,
         point_sigma_percent=None if sigmas is None else 100 * float(np.median(sigmas)) / diameter,
-        remarks=_remarks(photos, median_angle_deg),
+        remarks=_remarks(solved, photos, median_angle_deg),
     )
 
 
@@ -176,9 +177,13 @@ def _pairs(evidence: CameraEvidence) -> tuple[PairFacts, ...]:
     return tuple(sorted(found, key=lambda pair: -pair.num_verified))
 
 
-def _remarks(photos: tuple[PhotoFacts, ...], median_angle_deg: float | None) -> tuple[str, ...]:
+def _remarks(
+    solved: SolvedCameras, photos: tuple[PhotoFacts, ...], median_angle_deg: float | None
+) -> tuple[str, ...]:
     """What is weak, and what helps."""
     remarks = [f"{p.name} could not be placed: {p.why_unplaced}." for p in photos if p.why_unplaced]
+    if doubt := unconfirmed(solved):
+        remarks.append(doubt)
     placed = [photo for photo in photos if photo.why_unplaced is None]
     for photo in placed:
         if photo.most_verified is not None and photo.most_verified < STRONG_PAIR:

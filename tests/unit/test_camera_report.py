@@ -19,6 +19,7 @@ from backend.stages.camera_report import (
     camera_report_numbers,
     point_angles_deg,
 )
+from backend.stages.confirmation import FEWEST_CONFIRMING, num_confirming, unconfirmed
 from tests.synthetic_scene import OBJECT_UNIT, arc_cameras, photographed, surface_points, true_region
 
 LOST = "lost <1>.png"
@@ -27,11 +28,11 @@ DIAMETER = 2 * OBJECT_UNIT
 
 @cache
 def solved() -> SolvedCameras:
-    """Three photographs placed and one not; 40 points, of which the third photograph sees half."""
+    """Three photographs placed and one not; 80 points, of which the third photograph sees half."""
     scene = photographed(arc_cameras(3, 40, 64))
-    points = surface_points(np.tile([[0.0, -1.0, 0.0]], (40, 1)))
-    visibility = np.ones((40, 3), bool)
-    visibility[:20, 2] = False
+    points = surface_points(np.tile([[0.0, -1.0, 0.0]], (80, 1)))
+    visibility = np.ones((80, 3), bool)
+    visibility[:40, 2] = False
     verified = np.zeros((4, 4), np.int64)
     verified[0, 1] = verified[1, 0] = 400
     verified[1, 3] = verified[3, 1] = 99
@@ -43,10 +44,10 @@ def solved() -> SolvedCameras:
         num_features=np.array([500, 600, 3, 700]),
         num_matched=2 * verified,
         num_verified=verified,
-        error_px=np.where(visibility, np.linspace(0.1, 0.5, 40)[:, None] * [1, 2, 4], 0.0),
+        error_px=np.where(visibility, np.linspace(0.1, 0.5, 80)[:, None] * [1, 2, 4], 0.0),
         pose_covariance=covariance,
         lenses_free=True,
-        point_sigma_world=np.linspace(0.01, 0.03, 40),
+        point_sigma_world=np.linspace(0.01, 0.03, 80),
     )
     return replace(
         scene.solved(points),
@@ -68,34 +69,34 @@ def test_photographs_are_told_in_the_order_they_were_given() -> None:
     assert [p.name for p in (first, second, lost, third)] == list(solved().evidence.names)  # type: ignore[union-attr]
     assert (lost.why_unplaced, lost.num_features, lost.most_verified) == ("it is too dark", 3, 0)
     assert lost.num_points is lost.median_error_px is lost.place_sigma_percent is None
-    assert (first.num_points, third.num_points) == (40, 20)
+    assert (first.num_points, third.num_points) == (80, 40)
     assert (first.most_verified, second.most_verified, third.most_verified) == (400, 400, 99)
 
 
 def test_errors_and_certainty_by_their_definitions() -> None:
     report = report_of(solved())
-    errors = np.linspace(0.1, 0.5, 40)
+    errors = np.linspace(0.1, 0.5, 80)
     assert report.photos[0].median_error_px == pytest.approx(np.median(errors))
-    assert report.photos[3].high_error_px == pytest.approx(np.quantile(4 * errors[20:], 0.95))
+    assert report.photos[3].high_error_px == pytest.approx(np.quantile(4 * errors[40:], 0.95))
     assert report.photos[0].turn_sigma_deg == pytest.approx(np.degrees(0.003))
     assert report.photos[0].place_sigma_percent == pytest.approx(100 * 0.04 / DIAMETER)
     assert report.point_sigma_percent == pytest.approx(100 * 0.02 / DIAMETER)
-    seen = np.concatenate([errors, 2 * errors, 4 * errors[20:]])
+    seen = np.concatenate([errors, 2 * errors, 4 * errors[40:]])
     assert report.median_error_px == pytest.approx(np.median(seen))
 
 
 def test_tracks_and_angles_are_counted() -> None:
     """The cameras stand 20 degrees apart around the body's centre; its front lies nearer to them."""
     report = report_of(solved())
-    assert report.track_lengths == (20, 20)
-    assert sum(report.angle_counts) == 40
+    assert report.track_lengths == (40, 40)
+    assert sum(report.angle_counts) == 80
     centres = [view.camera.position for view in solved().views]
     rays = [c - solved().sparse_positions[0] for c in centres]
     unit = [ray / np.linalg.norm(ray) for ray in rays]
     angles = point_angles_deg(solved())
     assert angles[0] == pytest.approx(np.degrees(np.arccos(unit[0] @ unit[1])))
-    assert angles[39] == pytest.approx(np.degrees(np.arccos(unit[0] @ unit[2])))
-    assert report.median_angle_deg == pytest.approx((angles[0] + angles[39]) / 2)
+    assert angles[79] == pytest.approx(np.degrees(np.arccos(unit[0] @ unit[2])))
+    assert report.median_angle_deg == pytest.approx((angles[0] + angles[79]) / 2)
 
 
 def test_what_is_weak_is_said_with_a_remedy() -> None:
@@ -107,6 +108,20 @@ def test_what_is_weak_is_said_with_a_remedy() -> None:
     strong = replace(solved(), unplaced=(), evidence=all_strong())
     assert report_of(strong).remarks == ()
     assert "Nothing to worry about" in camera_report_html(report_of(strong))
+
+
+def test_cameras_that_no_third_photograph_confirms_are_doubted() -> None:
+    """A photograph's points that two alone see are its and its partner's to place as they like."""
+    strong = replace(solved(), unplaced=(), evidence=all_strong())
+    assert list(num_confirming(strong.sparse_visibility)) == [40, 40, 40]
+    assert unconfirmed(strong) is None
+    visibility = strong.sparse_visibility.copy()
+    visibility[40 : 80 - FEWEST_CONFIRMING + 1, 0] = False
+    weak = replace(strong, sparse_visibility=visibility)
+    (remark,) = report_of(weak).remarks
+    assert remark == unconfirmed(weak)
+    assert f"only {FEWEST_CONFIRMING - 1} points" in remark
+    assert unconfirmed(replace(weak, evidence=None)) is None
 
 
 def weakened() -> SolvedCameras:
@@ -138,7 +153,7 @@ def test_numbers_are_json_without_nan() -> None:
         (99, 198),
         (12, 24),
     ]
-    assert numbers["track_lengths"] == {"2": 20, "3": 20}
+    assert numbers["track_lengths"] == {"2": 40, "3": 40}
     assert numbers["pose_covariance_rad_world"]["view_00.png"][4][4] == pytest.approx(0.04**2)
     assert numbers["photos"][2]["why_unplaced"] == "it is too dark"
 
@@ -165,7 +180,7 @@ def test_given_cameras_have_no_matches_to_show() -> None:
     assert numbers["pairs"] == []
     assert numbers["pose_covariance_rad_world"] is None
     assert "How many photographs see a point" in page, "some are seen by three"
-    pairs = replace(given, sparse_visibility=np.tile([True, True, False], (40, 1)))
+    pairs = replace(given, sparse_visibility=np.tile([True, True, False], (80, 1)))
     assert "How many photographs see a point" not in camera_report_html(report_of(pairs))
     bare = replace(given, sparse_positions=np.zeros((0, 3)), sparse_visibility=np.zeros((0, 3), bool))
     page = camera_report_html(report_of(bare))
