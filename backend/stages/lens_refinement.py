@@ -26,7 +26,8 @@ _ERROR_INFLATION = 2.0
 
 _FOCAL_SIGMA_WITH_EXIF = 0.05
 """Relative. EXIF rounds to millimetres and knows nothing of focusing and of digital zoom."""
-_FOCAL_SIGMA_WITHOUT = 0.5
+_FOCAL_SIGMA_WITHOUT = 0.35
+"""Phones' and cameras' usual lenses are 0.7 to 2 longer sides; the guess is 1.2."""
 _CENTRE_SIGMA = 0.01
 """Of the longer side: what lenses and stabilised sensors are off by."""
 _RADIAL_SIGMA = 0.1

@@ -17,6 +17,7 @@ from jaxtyping import Float32, UInt8
 from ..images import fitted_size, read_image, resized
 from ..scene import Decision, Photo, Progress, Unplaced
 from .camera_evidence import camera_evidence
+from .confirmation import FEWEST_CONFIRMING, num_confirming
 from .lens_refinement import refine_lenses
 from .lenses import PlacedPhoto, Placement, rigid_matrix, sparse_points
 from .parallax import require_parallax, why_none_placed, why_unplaced
@@ -46,6 +47,14 @@ contrast would fill the places of fine features, which are the exact ones, with 
 _LARGEST_GAIN = 8.0
 
 _LARGEST_ERROR_PX = 2.0
+_CONFIRMED_ERROR_PX = 1.0
+
+_LEAST_CONTRAST = 0.02 / 3
+_LEAST_CONTRAST_SENSITIVE = 0.02 / 9
+"""Of a feature, the difference of Gaussians of which the picture's range is 1. SIFT's own, and a third."""
+_LARGEST_RATIO = 0.8
+_LARGEST_RATIO_SENSITIVE = 0.9
+"""Of a match's distance to that of its best rival (Lowe's test)."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,6 +64,9 @@ class _Attempt:
     pycolmap itself halves the first pair's two limits twice before it gives up.
     """
 
+    sensitive: bool
+    """With fainter features, and matches that are less unlike their rivals, for subjects with little texture.
+    An unknown focal length is held meanwhile: so few matches drag it anywhere."""
     guided: bool
     """Matches again along the epipolar lines: more of them, less exact, and slow."""
     initial_angle_deg: float
@@ -63,12 +75,18 @@ class _Attempt:
 
 
 _ATTEMPTS = (
-    _Attempt(guided=False, initial_angle_deg=16.0, initial_inliers=100, further_inliers=30),
-    _Attempt(guided=False, initial_angle_deg=6.0, initial_inliers=40, further_inliers=20),
-    _Attempt(guided=True, initial_angle_deg=16.0, initial_inliers=100, further_inliers=30),
-    _Attempt(guided=True, initial_angle_deg=6.0, initial_inliers=40, further_inliers=15),
+    _Attempt(sensitive=False, guided=False, initial_angle_deg=16.0, initial_inliers=100, further_inliers=30),
+    _Attempt(sensitive=False, guided=False, initial_angle_deg=6.0, initial_inliers=40, further_inliers=20),
+    _Attempt(sensitive=True, guided=False, initial_angle_deg=16.0, initial_inliers=100, further_inliers=30),
+    _Attempt(sensitive=True, guided=False, initial_angle_deg=6.0, initial_inliers=40, further_inliers=20),
+    _Attempt(sensitive=True, guided=True, initial_angle_deg=16.0, initial_inliers=100, further_inliers=30),
+    _Attempt(sensitive=True, guided=True, initial_angle_deg=6.0, initial_inliers=40, further_inliers=15),
 )
-"""Tried in this order until all photographs are placed, the guided ones until enough are."""
+"""Tried in this order until all photographs are placed and confirmed, the guided ones until enough are."""
+
+_DRAWS = 4
+"""Of chance, for each sensitive attempt. The walnut's three photographs come out right or 55 degrees wrong by
+what the first pair happens to agree on, but then with a quarter of the points that three confirm."""
 
 _ENOUGH_SHARE = 0.75
 """Of the photographs. Guided matching takes longer than all the rest, too long for a last photograph."""
@@ -89,15 +107,11 @@ def estimate_placement(
     Raises ReconstructionError: NO_OVERLAP, NO_PARALLAX, TOO_FEW_PLACED.
     """
     folder = workdir / "pictures"
-    database = workdir / "features.db"
     folder.mkdir(parents=True, exist_ok=True)
-    database.unlink(missing_ok=True)
     sizes = [_write_picture(photo, folder / picture_name(i), max_side_px) for i, photo in enumerate(photos)]
     num_features = min(max_features, max(_FEWEST_FEATURES, _FEATURE_BUDGET // len(photos)))
     groups = _lens_groups(photos, sizes)
-    register_pictures(database, folder, groups)
-    extract_features(database, folder, groups, num_features, progress)
-    model = _best_model(database, folder, workdir, len(photos), seed, progress)
+    model, database = _best_model(folder, groups, num_features, workdir, seed, progress)
     if model is None or model.num_reg_images() < 2:
         raise why_none_placed(database, len(photos))
     decisions = refine_lenses(model)
@@ -185,12 +199,19 @@ def register_pictures(database: Path, folder: Path, groups: Sequence[LensGroup])
 
 
 def extract_features(
-    database: Path, folder: Path, groups: Sequence[LensGroup], num_features: int, progress: Progress
+    database: Path,
+    folder: Path,
+    groups: Sequence[LensGroup],
+    num_features: int,
+    *,
+    sensitive: bool,
+    progress: Progress,
 ) -> None:
     options = pycolmap.FeatureExtractionOptions()
     options.use_gpu = False
     options.num_threads = _num_threads()
     options.sift.max_num_features = num_features
+    options.sift.peak_threshold = _LEAST_CONTRAST_SENSITIVE if sensitive else _LEAST_CONTRAST
     num_pixels = sum(group.width * group.height * len(group.names) for group in groups)
     options.sift.first_octave = -1 if num_pixels <= _FINE_PIXELS else 0
     names = [name for group in groups for name in group.names]
@@ -205,13 +226,19 @@ def extract_features(
         )
 
 
-def match_pictures(database: Path, guided: bool, seed: int) -> None:
+def match_pictures(database: Path, *, sensitive: bool, guided: bool, seed: int, again: bool = False) -> None:
+    """Matches between all pictures, and of them those that one motion of the camera explains.
+
+    `again` keeps the matches that are there and only asks anew, by the seed's chance, what explains them.
+    """
     with pycolmap.Database.open(database) as opened:
-        opened.clear_matches()
+        if not again:
+            opened.clear_matches()
         opened.clear_two_view_geometries()
     matching = pycolmap.FeatureMatchingOptions()
     matching.use_gpu = False
     matching.guided_matching = guided
+    matching.sift.max_ratio = _LARGEST_RATIO_SENSITIVE if sensitive else _LARGEST_RATIO
     # Guided matching holds a full table of distances per thread.
     matching.num_threads = 1 if guided else _num_threads()
     verification = pycolmap.TwoViewGeometryOptions()
@@ -225,28 +252,73 @@ def match_pictures(database: Path, guided: bool, seed: int) -> None:
 
 
 def _best_model(
-    database: Path, folder: Path, workdir: Path, num_photos: int, seed: int, progress: Progress
-) -> pycolmap.Reconstruction | None:
-    """The model with most photographs of all attempts; None where there is none at all."""
+    folder: Path,
+    groups: Sequence[LensGroup],
+    num_features: int,
+    workdir: Path,
+    seed: int,
+    progress: Progress,
+) -> tuple[pycolmap.Reconstruction | None, Path]:
+    """The best model of all attempts, None where there is none at all, and the database of its features."""
+    num_photos = sum(len(group.names) for group in groups)
     best: pycolmap.Reconstruction | None = None
-    matched_guided: bool | None = None
+    best_database = database = workdir / "features.db"
+    extracted: bool | None = None
+    matched: tuple[bool, bool] | None = None
     for number, attempt in enumerate(_ATTEMPTS):
-        num_wanted = num_photos * (_ENOUGH_SHARE if attempt.guided else 1.0)
-        if best is not None and best.num_reg_images() >= num_wanted:
+        if best is not None and _is_enough(best, attempt, num_photos):
             break
-        if attempt.guided != matched_guided:
-            progress(0.5 + 0.1 * number, "Matching photographs")
-            match_pictures(database, attempt.guided, seed)
-            matched_guided = attempt.guided
-        on_photo = partial(progress, 0.6 + 0.1 * number, "Placing cameras")
-        for model in _mapped(database, folder, workdir, attempt, seed, on_photo):
-            if best is None or _merit(model) > _merit(best):
-                best = model
-    return best
+        share = number / len(_ATTEMPTS)
+        if attempt.sensitive != extracted:
+            database = workdir / ("sensitive.db" if attempt.sensitive else "features.db")
+            database.unlink(missing_ok=True)
+            register_pictures(database, folder, groups)
+            on_feature = partial(_within, progress, share, share + 0.5 / len(_ATTEMPTS))
+            extract_features(
+                database, folder, groups, num_features, sensitive=attempt.sensitive, progress=on_feature
+            )
+            extracted = attempt.sensitive
+        progress(share + 0.5 / len(_ATTEMPTS), "Matching photographs")
+        on_photo = partial(progress, share + 0.8 / len(_ATTEMPTS), "Placing cameras")
+        for draw in range(_DRAWS if attempt.sensitive and not attempt.guided else 1):
+            match_pictures(
+                database,
+                sensitive=attempt.sensitive,
+                guided=attempt.guided,
+                again=(attempt.sensitive, attempt.guided) == matched,
+                seed=seed + draw,
+            )
+            matched = attempt.sensitive, attempt.guided
+            for model in _mapped(database, folder, workdir, attempt, seed + draw, on_photo):
+                if best is None or _merit(model) > _merit(best):
+                    best, best_database = model, database
+    return best, best_database if best is not None else database
 
 
-def _merit(model: pycolmap.Reconstruction) -> tuple[int, int]:
-    return model.num_reg_images(), model.num_points3D()
+def _within(progress: Progress, start: float, end: float, share: float, text: str) -> None:
+    progress(start + (end - start) * share, text)
+
+
+def _is_enough(model: pycolmap.Reconstruction, attempt: _Attempt, num_photos: int) -> bool:
+    """Whether the attempt is not needed any more."""
+    num_placed = model.num_reg_images()
+    if attempt.guided and num_placed >= _ENOUGH_SHARE * num_photos:
+        return True
+    confirmed = num_photos < 3 or _fewest_confirming(model) >= FEWEST_CONFIRMING
+    return num_placed == num_photos and confirmed
+
+
+def _fewest_confirming(model: pycolmap.Reconstruction) -> int:
+    _, visibility = sparse_points(model, list(model.reg_image_ids()))
+    return int(num_confirming(visibility).min())
+
+
+def _merit(model: pycolmap.Reconstruction) -> tuple[int, int, int]:
+    """More photographs first, then points that three of them confirm to a pixel, then points."""
+    num_confirmed = sum(
+        point.track.length() >= 3 and point.error < _CONFIRMED_ERROR_PX for point in model.points3D.values()
+    )
+    return model.num_reg_images(), num_confirmed, model.num_points3D()
 
 
 def _mapped(
@@ -270,9 +342,13 @@ def _mapped(
     options.mapper.init_min_num_inliers = attempt.initial_inliers
     options.mapper.abs_pose_min_num_inliers = attempt.further_inliers
     with pycolmap.Database.open(database) as opened:
-        known = {camera.camera_id for camera in opened.read_all_cameras() if camera.has_prior_focal_length}
+        lenses = opened.read_all_cameras()
     # A focal length from EXIF is better than what two photographs can tell; refine_lenses weighs the two.
-    options.constant_cameras = options.mapper.constant_cameras = known
+    held = {lens.camera_id for lens in lenses if lens.has_prior_focal_length or attempt.sensitive}
+    options.constant_cameras = options.mapper.constant_cameras = held
+    if attempt.sensitive:
+        options.mapper.abs_pose_refine_focal_length = options.mapper.abs_pose_refine_extra_params = False
+        options.ba_refine_focal_length = options.ba_refine_extra_params = False
     models = pycolmap.incremental_mapping(
         database, folder, workdir, options, initial_image_pair_callback=on_photo, next_image_callback=on_photo
     )

@@ -45,8 +45,8 @@ def triangulate(
         for i, c in enumerate(cameras)
     ]
     register_pictures(database, folder, groups)
-    extract_features(database, folder, groups, _NUM_FEATURES, progress)
-    match_pictures(database, guided=False, seed=seed)
+    extract_features(database, folder, groups, _NUM_FEATURES, sensitive=False, progress=progress)
+    match_pictures(database, sensitive=False, guided=False, seed=seed)
     return _points_of_pairs(database, cameras)
 
 

@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from backend.scene import SolvedCameras, no_progress
 from backend.stages.cameras import CamerasConfig, solve_cameras
+from backend.stages.confirmation import FEWEST_CONFIRMING, num_confirming, unconfirmed
 from backend.stages.nerfstudio import OPENCV_FROM_OPENGL
 from backend.stages.photos import PhotosConfig, load_photos
 
@@ -120,3 +121,16 @@ def test_one_camera_has_one_focal_length_whatever_it_looks_at(tmp_path: Path) ->
         (decision,) = solve(paths, tmp_path / name).decisions
         focal_px.append(float(decision.choice.split()[0]))
     assert focal_px[0] == pytest.approx(focal_px[1], rel=0.03)
+
+
+def test_three_dark_photographs_of_little_texture(tmp_path: Path) -> None:
+    """With the usual features hardly anything confirms these cameras, and they are some 60 degrees wrong."""
+    folder = DATA / "photos_robovision_1"
+    solved = solve([folder / "images" / f"image_camera0{number}.png" for number in (1, 2, 3)], tmp_path)
+    assert solved.unplaced == ()
+    poses = true_poses(folder / "transforms.json")
+    true = [poses[view.name] for view in solved.views]
+    ours = [np.linalg.inv(view.camera.camera_from_world) for view in solved.views]
+    assert rotation_errors_deg(ours, true).max() < 3
+    assert num_confirming(solved.sparse_visibility).min() >= FEWEST_CONFIRMING
+    assert unconfirmed(solved) is None
