@@ -264,31 +264,33 @@ def _best_model(
     best: pycolmap.Reconstruction | None = None
     best_database = database = workdir / "features.db"
     extracted: bool | None = None
-    matched: tuple[bool, bool] | None = None
+    matched: tuple[bool, bool, int] | None = None
     for number, attempt in enumerate(_ATTEMPTS):
         if best is not None and _is_enough(best, attempt, num_photos):
             break
-        share = number / len(_ATTEMPTS)
+        share = 0.5 + 0.08 * number
         if attempt.sensitive != extracted:
             database = workdir / ("sensitive.db" if attempt.sensitive else "features.db")
             database.unlink(missing_ok=True)
             register_pictures(database, folder, groups)
-            on_feature = partial(_within, progress, share, share + 0.5 / len(_ATTEMPTS))
+            on_feature = partial(_within, progress, share, share + 0.08) if attempt.sensitive else progress
             extract_features(
                 database, folder, groups, num_features, sensitive=attempt.sensitive, progress=on_feature
             )
             extracted = attempt.sensitive
-        progress(share + 0.5 / len(_ATTEMPTS), "Matching photographs")
-        on_photo = partial(progress, share + 0.8 / len(_ATTEMPTS), "Placing cameras")
+        on_photo = partial(progress, share + 0.06, "Placing cameras")
         for draw in range(_DRAWS if attempt.sensitive and not attempt.guided else 1):
-            match_pictures(
-                database,
-                sensitive=attempt.sensitive,
-                guided=attempt.guided,
-                again=(attempt.sensitive, attempt.guided) == matched,
-                seed=seed + draw,
-            )
-            matched = attempt.sensitive, attempt.guided
+            wanted = attempt.sensitive, attempt.guided, draw
+            if wanted != matched:
+                progress(share + 0.04, "Matching photographs")
+                match_pictures(
+                    database,
+                    sensitive=attempt.sensitive,
+                    guided=attempt.guided,
+                    again=matched is not None and matched[:2] == wanted[:2],
+                    seed=seed + draw,
+                )
+                matched = wanted
             for model in _mapped(database, folder, workdir, attempt, seed + draw, on_photo):
                 if best is None or _merit(model) > _merit(best):
                     best, best_database = model, database
@@ -348,7 +350,6 @@ def _mapped(
     options.constant_cameras = options.mapper.constant_cameras = held
     if attempt.sensitive:
         options.mapper.abs_pose_refine_focal_length = options.mapper.abs_pose_refine_extra_params = False
-        options.ba_refine_focal_length = options.ba_refine_extra_params = False
     models = pycolmap.incremental_mapping(
         database, folder, workdir, options, initial_image_pair_callback=on_photo, next_image_callback=on_photo
     )
