@@ -83,9 +83,6 @@ def _measure_all(parsed: argparse.Namespace, program: tuple[str, ...], request: 
     machine = machine_facts()
     about = {
         "suite": parsed.suite,
-        "presets": parsed.presets,
-        "budgets_s": parsed.budgets,
-        "seeds": list(range(parsed.seeds)),
         "device": device,
         "machine": machine,
         "missing": found.missing,
@@ -104,7 +101,7 @@ def _measure_all(parsed: argparse.Namespace, program: tuple[str, ...], request: 
         return [runs[trial] for trial in asked_first if trial in runs]
 
     def write() -> None:
-        write_results(parsed.output, about, measured())
+        write_results(parsed.output, {**about, **_asked(measured())}, measured())
 
     if runs:
         _say(f"Kept from before, as nothing that it depends on has changed: {len(runs)}.")
@@ -122,8 +119,18 @@ def _measure_all(parsed: argparse.Namespace, program: tuple[str, ...], request: 
             write()
     if parsed.record is not None:
         today = datetime.now(UTC).date().isoformat()
-        write_record(parsed.record, about, measured(), code=measuring_fingerprint(), date=today)
+        everything = {**about, **_asked(measured())}
+        write_record(parsed.record, everything, measured(), code=measuring_fingerprint(), date=today)
     sys.stdout.write(f"{parsed.output / 'table.md'}\n")
+
+
+def _asked(runs: Sequence["Measurement"]) -> dict[str, object]:
+    """What the runs were asked for, in this call or in those before whose runs are kept."""
+    return {
+        "presets": list(dict.fromkeys(run.preset for run in runs)),
+        "budgets_s": sorted({run.budget_s for run in runs if run.budget_s is not None}),
+        "seeds": sorted({run.seed for run in runs}),
+    }
 
 
 def _check(parsed: argparse.Namespace, found: Found) -> None:

@@ -110,7 +110,7 @@ def test_each_preset_is_run_with_each_budget_too(photos: Path, tmp_path: Path) -
     words = parsed(photos, output, "--seeds", "1", "--presets", "fast", "--budgets", "10", "2.5")
     assert command.benchmark(words, program=fake_program()) == EXIT_FINE
     results = json.loads((output / "results.json").read_text())
-    assert results["budgets_s"] == [10.0, 2.5]
+    assert results["budgets_s"] == [2.5, 10.0]
     assert [(run["preset"], run["budget_s"]) for run in results["runs"]] == [
         ("fast", None),
         ("fast", 10.0),
@@ -120,6 +120,17 @@ def test_each_preset_is_run_with_each_budget_too(photos: Path, tmp_path: Path) -
     assert {report["settings"]["train.budget_s"] for report in reports} == {None, 10.0, 2.5}
     rows = (output / "table.md").read_text()
     assert all(f"| toy | {shown} |" in rows for shown in ("fast", "fast@10s", "fast@2.5s"))
+
+
+def test_what_earlier_calls_asked_for_is_told_with_their_runs(photos: Path, tmp_path: Path) -> None:
+    output, record = tmp_path / "out", tmp_path / "record"
+    for words in (("--presets", "fast"), ("--presets", "balanced", "--only-budgets", "--budgets", "10")):
+        asked = parsed(photos, output, "--seeds", "1", "--record", str(record), *words)
+        assert command.benchmark(asked, program=fake_program()) == EXIT_FINE
+    for path in (output / "results.json", record / "toy.json"):
+        results = json.loads(path.read_text())
+        assert sorted(results["presets"]) == ["balanced", "fast"]
+        assert (results["budgets_s"], results["seeds"]) == ([10.0], [0])
 
 
 def test_what_has_no_end_is_run_with_budgets_only(
