@@ -111,10 +111,10 @@ def estimate_placement(
     sizes = [_write_picture(photo, folder / picture_name(i), max_side_px) for i, photo in enumerate(photos)]
     num_features = min(max_features, max(_FEWEST_FEATURES, _FEATURE_BUDGET // len(photos)))
     groups = _lens_groups(photos, sizes)
-    model, database = _best_model(folder, groups, num_features, workdir, seed, progress)
+    model, database, features = _best_model(folder, groups, num_features, workdir, seed, progress)
     if model is None or model.num_reg_images() < 2:
         raise why_none_placed(database, len(photos))
-    decisions = refine_lenses(model)
+    decisions = (*features, *refine_lenses(model))
     _drop_bad_points(model)
     require_parallax(model, database)
     return _placement(model, photos, decisions, database)
@@ -258,10 +258,14 @@ def _best_model(
     workdir: Path,
     seed: int,
     progress: Progress,
-) -> tuple[pycolmap.Reconstruction | None, Path]:
-    """The best model of all attempts, None where there is none at all, and the database of its features."""
+) -> tuple[pycolmap.Reconstruction | None, Path, tuple[Decision, ...]]:
+    """The best model of all attempts, None where there is none at all, and the database of its features.
+
+    With them the decision about features, where fainter ones were tried.
+    """
     num_photos = sum(len(group.names) for group in groups)
     best: pycolmap.Reconstruction | None = None
+    best_of_usual: pycolmap.Reconstruction | None = None
     best_database = database = workdir / "features.db"
     extracted: bool | None = None
     matched: tuple[bool, bool, int] | None = None
@@ -294,7 +298,33 @@ def _best_model(
             for model in _mapped(database, folder, workdir, attempt, seed + draw, on_photo):
                 if best is None or _merit(model) > _merit(best):
                     best, best_database = model, database
-    return best, best_database if best is not None else database
+        if not attempt.sensitive:
+            best_of_usual = best
+    if best is None or not extracted:
+        return best, database, ()
+    return best, best_database, (_why_fainter(best_of_usual, best, num_photos),)
+
+
+def _why_fainter(
+    usual: pycolmap.Reconstruction | None, best: pycolmap.Reconstruction, num_photos: int
+) -> Decision:
+    before = f"with the usual ones {_how_sure(usual, num_photos)}"
+    if best is usual:
+        return Decision(
+            what="features", choice="the usual ones", because=f"{before}; fainter ones gave no more"
+        )
+    after = f"with fainter ones {_how_sure(best, num_photos)}"
+    return Decision(what="features", choice="fainter ones", because=f"{before}, {after}")
+
+
+def _how_sure(model: pycolmap.Reconstruction | None, num_photos: int) -> str:
+    if model is None:
+        return "no photographs could be placed"
+    confirming = _fewest_confirming(model)
+    return (
+        f"{model.num_reg_images()} of {num_photos} photographs were placed and the least sure of them "
+        f"confirmed by {confirming} points that three see"
+    )
 
 
 def _within(progress: Progress, start: float, end: float, share: float, text: str) -> None:

@@ -134,3 +134,6 @@ def test_three_dark_photographs_of_little_texture(tmp_path: Path) -> None:
     assert rotation_errors_deg(ours, true).max() < 3
     assert num_confirming(solved.sparse_visibility).min() >= FEWEST_CONFIRMING
     assert unconfirmed(solved) is None
+    told = solved.decisions[0]
+    assert (told.what, told.choice) == ("features", "fainter ones")
+    assert told.because.startswith("with the usual ones 3 of 3 photographs were placed")
