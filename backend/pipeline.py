@@ -33,6 +33,7 @@ from .stages.cameras import solve_cameras
 from .stages.confirmation import unconfirmed
 from .stages.mesh import extract_mesh
 from .stages.neus_fit import NeusConfig, fit_neus
+from .stages.outlines_alone import hollows_filled
 from .stages.photos import load_photos, match_masks, named_photos
 from .stages.radiance_field import Radiance
 from .stages.radiance_fit import RadianceConfig, fit_radiance
@@ -327,6 +328,8 @@ def _reconstructed(
     previews.show_cameras(solved, region)
     match = partial(stages.match_views, solved, region, settings.stereo, device=device)
     stereo = this.stage("stereo", match)
+    if settings.stereo is not None and (lack := hollows_filled(stereo)):
+        this.warn(lack)
     solved = with_refined(solved, stereo)
     views = solved.views
     if len(stereo.points.positions):

@@ -131,11 +131,14 @@ def _rim_distances(
 ) -> PointDistances:
     """What the rims say of the nodes around them; less, the farther they are from what was measured.
 
-    There only the field's own guess says where a ray touches, unless silhouettes bound the depth.
+    There only the field's own guess says where a ray touches, unless silhouettes bound the depth. Where nothing
+    was measured, guesses are all there is.
     """
     positions, normals = rim_points(rays, distance)
-    apart, _ = measured.query(positions.cpu().numpy(), workers=-1)
-    apart = torch.tensor(apart, dtype=positions.dtype, device=positions.device)
+    apart = torch.zeros_like(positions[:, 0])
+    if measured.n:
+        nearest, _ = measured.query(positions.cpu().numpy(), workers=-1)
+        apart = torch.tensor(nearest, dtype=positions.dtype, device=positions.device)
     doubt = (1 - depth_is_bounded(scene)) * (1 + (apart / _RIM_REACH).square())
     return point_distances(positions, normals, weight * torch.exp(-doubt), distance.shape[0])
 

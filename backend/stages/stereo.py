@@ -9,6 +9,7 @@ smaller sizes of the photographs measure.
 """
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -16,13 +17,13 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from ..errors import ErrorCode, ReconstructionError
 from ..maths.backdrop import find_backdrop
 from ..maths.geometry import pinhole_in_object, pixel_centres, sample_image, unproject
 from ..maths.inverse_depth import fit_planes, normals_from_planes
 from ..maths.texture import leverage
 from ..scene import DepthMap, Progress, Region, StereoResult, SurfacePoints, View, within
 from .depth_maps import Measured, depth_maps
+from .outlines_alone import FEWEST_POINTS, check_enough, no_points, outlines_alone
 from .stereo_config import StereoConfig
 from .stereo_windows import neighbours, pyramid, sees_region
 from .strays import without_strays
@@ -33,43 +34,27 @@ def match_views(
 ) -> StereoResult:
     """Depth maps and points of all views, object frame.
 
-    Raises ReconstructionError(NO_SURFACE) if the photographs agree on next to nothing.
+    Raises ReconstructionError(NO_SURFACE) if the photographs agree on next to nothing and hardly any has a
+    mask; with masks there are no points then, and a decision says so.
     """
     with torch.no_grad():
         pyramids = [pyramid(view, region, config, device) for view in views]
         nearby = neighbours([sizes[0].camera for sizes in pyramids], config.num_sources)
         sizes = depth_maps(pyramids, nearby, config, within(progress, 0.0, 0.95))
         points = _points(views, sizes, config)
-    _check_enough(points, masked=any(view.mask is not None for view in views))
+    check_enough(points, views)
     full_size = (_full_size(view, maps, region, config) for view, maps in zip(views, sizes, strict=True))
-    return StereoResult(points=without_strays(points), depth_maps=tuple(full_size))
+    found = StereoResult(points=points, depth_maps=tuple(full_size))
+    if len(points.positions) < FEWEST_POINTS:
+        return outlines_alone(found)
+    return replace(found, points=without_strays(points))
 
 
 def unmatched(views: tuple[View, ...]) -> StereoResult:
     """What stereo gives where it was not asked: no points, and depth maps in which nothing was measured."""
-    none, nothing = np.zeros((0, 3), np.float32), np.zeros(0, np.int64)
-    points = SurfacePoints(
-        positions=none,
-        normals=none,
-        colours_srgb=none,
-        confidence=none[:, 0],
-        num_views=nothing,
-        view_index=nothing,
-    )
     blanks = (np.zeros((view.camera.height, view.camera.width), np.float32) for view in views)
     maps = (DepthMap(depth=blank, confidence=blank, empty=None, subject=None) for blank in blanks)
-    return StereoResult(points=points, depth_maps=tuple(maps))
-
-
-def _check_enough(points: SurfacePoints, *, masked: bool) -> None:
-    if len(points.positions) < 100:
-        masks = " Check that the masks are white on the subject and belong to these photographs."
-        raise ReconstructionError(
-            ErrorCode.NO_SURFACE,
-            f"The photographs agree on only {len(points.positions)} points of the surface.",
-            "Take photographs that overlap by more than half, sharp and evenly lit; shiny, transparent "
-            "or plain surfaces need masks, or some texture such as dust or chalk." + masks * masked,
-        )
+    return StereoResult(points=no_points(), depth_maps=tuple(maps))
 
 
 def _points(views: tuple[View, ...], sizes: list[list[Measured]], config: StereoConfig) -> SurfacePoints:

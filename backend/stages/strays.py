@@ -22,6 +22,8 @@ def without_strays(points: SurfacePoints) -> SurfacePoints:
     A point weighs by how sure its own photographs are; nothing else asks whether its neighbours agree.
     """
     positions = points.positions.astype(np.float64)
+    if not len(positions):
+        return points
     asked = positions[np.linspace(0, len(positions) - 1, min(_ASKED, len(positions))).astype(int)]
     if strays(asked).mean() <= MOST_STRAYS:
         return points

@@ -24,9 +24,9 @@ _MOST = (0.02, 0.98)
 def ball_behind(scene: Measurements, radius: float, nodes: int) -> Float[Tensor, "nodes nodes nodes"]:
     """(|x - c|^2 - r^2) / 2r of the ball that touches the middle of the measured points from behind.
 
-    Its radius is given in half widths of the subject.
+    Its radius is given in half widths of the subject. Of no points it is a ball in the region's middle.
     """
-    mean_p, mean_n = _mean(scene, scene.positions), _mean(scene, scene.normals)
+    mean_p, mean_n = _middle(scene), _mean(scene, scene.normals)
     r = radius * _half_width(scene, mean_p)
     apart = node_positions(nodes, scene.positions.device) - (mean_p - r * mean_n)
     return (apart.square().sum(dim=-1) - r * r) / (2 * r)
@@ -37,8 +37,10 @@ def explained_radius(scene: Measurements) -> float:
 
     Least squares of p = c + r n over points and normals: for points on one side what the turning of their
     normals says. Where photographs are taken from all around, no side is left to be assumed, and the
-    flattest ball disturbs least.
+    flattest ball disturbs least; and where nothing was measured, the subject is as deep as wide.
     """
+    if not len(scene.positions):
+        return 1.0
     mean_p, mean_n = _mean(scene, scene.positions), _mean(scene, scene.normals)
     turned = scene.normals - mean_n
     spread = _mean(scene, turned.square()).sum()
@@ -63,8 +65,14 @@ def seen_depth(scene: Measurements) -> float:
     return (1 - depth_is_bounded(scene)) * min(half, 1.0)
 
 
+def _middle(scene: Measurements) -> Float[Tensor, "3"]:
+    return _mean(scene, scene.positions) if len(scene.positions) else scene.region_centre
+
+
 def _mean(scene: Measurements, values: Float[Tensor, "points 3"]) -> Float[Tensor, "3"]:
-    """Over the points, weighted by their confidence."""
+    """Over the points, weighted by their confidence; 0 of none."""
+    if not len(values):
+        return values.new_zeros(3)
     return (scene.confidence / scene.confidence.sum()) @ values
 
 

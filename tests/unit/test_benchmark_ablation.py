@@ -39,7 +39,7 @@ QUICK = (
     Variant(name="as it is"),
     Variant(name="without rendering", changes={"train.steps": (0, 0)}),
     Variant(name="few faces", changes={"train.steps": (0, 0), "mesh.max_faces": 500}),
-    Variant(name="blind", changes={"stereo.min_correlation": 1.0}),
+    Variant(name="blind", changes={"stereo.min_correlation": 1.0}, with_masks=False),
 )
 
 

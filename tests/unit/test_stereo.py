@@ -13,6 +13,7 @@ from backend.maths.geometry import pinhole_in_object
 from backend.maths.raycast import camera_rays
 from backend.scene import Camera, Region, StereoResult, View, no_progress, transform_points
 from backend.stages.depth_maps import depth_maps
+from backend.stages.outlines_alone import hollows_filled
 from backend.stages.stereo import match_views
 from backend.stages.stereo_config import StereoConfig
 from backend.stages.stereo_windows import pyramid, views_between
@@ -385,13 +386,23 @@ def test_points_lie_in_the_region() -> None:
 
 
 @pytest.mark.parametrize("noisy", [False, True])
-def test_a_masked_subject_without_texture_is_no_surface(noisy: bool) -> None:
+def test_a_masked_subject_without_texture_has_no_points(noisy: bool) -> None:
+    """So its outlines alone are left; without them there is no surface."""
     views = photographed(arc_cameras(3, 30, 160), textured=False).views
     if noisy:
         views = tuple(noise(view, seed) for seed, view in enumerate(views))
-    with pytest.raises(ReconstructionError, match="agree on only") as raised:
-        match(views)
-    assert raised.value.code == ErrorCode.NO_SURFACE
+    result = match(views)
+    assert not len(result.points.positions)
+    assert not any(map_.depth.any() or map_.confidence.any() for map_ in result.depth_maps)
+    assert "outlines" in result.decisions[0].choice
+    assert "outlines" in (hollows_filled(result) or "")
+    two_masks = (*views[:2], replace(views[2], mask=None))
+    of_all_else = tuple(replace(view, mask=1 - view.mask) for view in views if view.mask is not None)
+    for without_outlines in (two_masks, of_all_else):
+        with pytest.raises(ReconstructionError, match="agree on only") as raised:
+            match(without_outlines)
+        assert raised.value.code == ErrorCode.NO_SURFACE
+        assert "Check that the masks" in raised.value.remedy
 
 
 def test_photographs_of_nothing_are_no_surface() -> None:

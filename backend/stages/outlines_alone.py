@@ -1,0 +1,87 @@
+"""Photographs that agree on next to nothing: where they have masks, outlines alone give the shape.
+
+Photographs a fifth of a circle apart share no patch that looks alike, and chrome or glass shows none twice.
+Their silhouettes still bound the subject: what is left is its visual hull, made smooth.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+
+from ..errors import ErrorCode, ReconstructionError
+from ..scene import Decision, DepthMap, StereoResult, SurfacePoints, View
+
+FEWEST_POINTS = 100
+"""With fewer, what agreed did so by chance."""
+FEWEST_OUTLINES = 3
+"""Two leave a box."""
+_MOST_OF_EDGE = 0.5
+"""Of a picture's edge that may show the subject: more is a mask of what is around it."""
+
+
+def check_enough(points: SurfacePoints, views: tuple[View, ...]) -> None:
+    """Raises ReconstructionError(NO_SURFACE) where neither points nor outlines tell the shape."""
+    told = sum(map(_shows_outline, views)) >= FEWEST_OUTLINES and _are_pictures(views)
+    if told or len(points.positions) >= FEWEST_POINTS:
+        return
+    masked = any(view.mask is not None for view in views)
+    about_masks = " Check that the masks are white on the subject and belong to these photographs."
+    raise ReconstructionError(
+        ErrorCode.NO_SURFACE,
+        f"The photographs agree on only {len(points.positions)} points of the surface.",
+        "Take photographs that overlap by more than half, sharp and evenly lit; shiny, transparent "
+        "or plain surfaces need masks, or some texture such as dust or chalk." + about_masks * masked,
+    )
+
+
+def _shows_outline(view: View) -> bool:
+    """Whether there is a mask, and of something that the picture shows whole, mostly."""
+    if view.mask is None:
+        return False
+    edge = np.ones(view.mask.shape, np.bool_)
+    edge[1:-1, 1:-1] = False
+    return bool((view.mask[edge] > 0.5).mean() <= _MOST_OF_EDGE)
+
+
+def _are_pictures(views: tuple[View, ...]) -> bool:
+    """Whether all are numbers: one that is not spoils what it is compared with, and the colours."""
+    return all(bool(np.isfinite(view.image_srgb).all()) for view in views)
+
+
+def no_points() -> SurfacePoints:
+    """None at all."""
+    none, nothing = np.zeros((0, 3), np.float32), np.zeros(0, np.int64)
+    return SurfacePoints(
+        positions=none,
+        normals=none,
+        colours_srgb=none,
+        confidence=none[:, 0],
+        num_views=nothing,
+        view_index=nothing,
+    )
+
+
+def outlines_alone(found: StereoResult) -> StereoResult:
+    """What stereo found by chance left out; where backdrop and subject are stays known."""
+    decision = Decision(
+        what="measured points",
+        choice="left out: outlines alone give the shape",
+        because=f"the photographs agree on only {len(found.points.positions)} points",
+    )
+    maps = tuple(_unmeasured(map_) for map_ in found.depth_maps)
+    return replace(found, points=no_points(), depth_maps=maps, decisions=(*found.decisions, decision))
+
+
+def _unmeasured(map_: DepthMap) -> DepthMap:
+    return replace(map_, depth=np.zeros_like(map_.depth), confidence=np.zeros_like(map_.confidence))
+
+
+def hollows_filled(stereo: StereoResult) -> str | None:
+    """For a person, where photographs were compared: what the shape lacks, and what helps; else None."""
+    if len(stereo.points.positions):
+        return None
+    return (
+        "The photographs agree on next to nothing, so the shape comes from the outlines of the masks alone: "
+        "hollows are filled, and what no outline shows is a guess. Photographs 10 to 20 degrees apart, or "
+        "some texture such as dust or chalk, would show more."
+    )
