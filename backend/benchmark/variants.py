@@ -64,6 +64,7 @@ VARIANTS = (
         name="without carving by measured depth",
         changes={"train.linear.seen_through": _NEXT_TO_NOTHING},
     ),
+    Variant(name="without outlines inside the subject", changes={"train.linear.inner_outlines": False}),
     Variant(
         name="without any free space",
         changes={

@@ -1,5 +1,6 @@
 """The linear part of the fit: the smoothest field that agrees with points, silhouettes and free space."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -11,6 +12,7 @@ from ..maths.evidence import PointDistances, merged_points, point_distances, see
 from ..maths.grid import locate, spacing, splat
 from ..maths.nearest import nearest_tree
 from ..maths.smooth_fit import fit_smooth
+from .inner_outlines import FarSide
 from .measurements import Measurements
 from .rims import RimRays, rim_points, rim_rays
 from .silhouettes import SilhouetteRays, inside_along, least_distance, middles, silhouette_rays
@@ -32,6 +34,8 @@ class LinearConfig:
     """Off silhouettes, where the field says otherwise."""
     seen_through: float = 0.2
     """In front of what was measured, where the field says otherwise."""
+    inner_outlines: bool = True
+    """Whether bridges are looked for where photographs show that one part hides another."""
     silhouettes: float = 0.2
     """On rays through the subject that miss the field."""
     rims: float = 0.2
@@ -61,12 +65,14 @@ def fit_level(
     radius: float,
     rounds: int,
     config: LinearConfig,
+    far: Sequence[FarSide] = (),
 ) -> Float[Tensor, "nodes nodes nodes"]:
     """The smoothest field near the points' planes that silhouettes allow, else like the level before.
 
     Smooth is measured against the ball behind, whose curvature is free. Free space (f > 0) and silhouettes
     (f < 0 somewhere on each ray) are inequalities: they pull only where the field says otherwise, which
-    takes a few rounds; `rounds` at most, fewer where the surface comes to rest.
+    takes a few rounds; `rounds` at most, fewer where the surface comes to rest. What is before `far` sides is
+    free as what is before measured depth.
     """
     nodes = before.shape[0]
     h = spacing(nodes)
@@ -78,6 +84,8 @@ def fit_level(
     bound = least_distance(scene, nodes)
     free = bound > 0
     through = _seen_through_any(scene, nodes, 3 * h)
+    for side in far:
+        through |= seen_through(side.camera, side.depth, 2 * h, nodes)
     through_subject, pulled = silhouette_rays(scene, nodes), torch.zeros((nodes**3, 2), device=before.device)
     met_along = torch.full_like(through_subject.entry, torch.inf)
     rays, nearest = rim_rays(scene, nodes), nearest_tree(points[0].cpu().numpy())
@@ -131,8 +139,8 @@ def _rim_distances(
 ) -> PointDistances:
     """What the rims say of the nodes around them; less, the farther they are from what was measured.
 
-    There only the field's own guess says where a ray touches, unless silhouettes bound the depth. Where nothing
-    was measured, guesses are all there is.
+    There only the field's own guess says where a ray touches, unless silhouettes bound the depth. Where
+    nothing was measured, guesses are all there is.
     """
     positions, normals = rim_points(rays, distance)
     apart = torch.zeros_like(positions[:, 0])
@@ -145,6 +153,6 @@ def _rim_distances(
 
 def _seen_through_any(scene: Measurements, nodes: int, margin: float) -> Bool[Tensor, "nodes nodes nodes"]:
     free = torch.zeros((nodes, nodes, nodes), dtype=torch.bool, device=scene.positions.device)
-    for camera, depth in zip(scene.cameras, scene.depths, strict=True):
+    for camera, depth in zip(scene.cameras, scene.sure_depths, strict=True):
         free |= seen_through(camera, depth, margin, nodes)
     return free

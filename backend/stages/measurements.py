@@ -9,7 +9,7 @@ from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 
 from ..maths.geometry import Pinhole, pinhole_in_object
-from ..scene import DepthMap, Region, StereoResult, View
+from ..scene import Region, StereoResult, View
 
 SURE = 0.3
 """Confidence of a depth that carves, or that opens a scene at the pictures' edges.
@@ -32,12 +32,21 @@ class Measurements:
     certain: list[Float[Tensor, "height width"] | None]
     """The same, < 0 where the subject surely is."""
     depths: list[Float[Tensor, "height width"]]
+    """Along the axes; 0 where nothing was measured."""
+    confidences: list[Float[Tensor, "height width"]]
+    """Of these, 0 to 1."""
     positions: Float[Tensor, "points 3"]
     normals: Float[Tensor, "points 3"]
     colours: Float[Tensor, "points 3"]
     confidence: Float[Tensor, "points"]
     region_centre: Float[Tensor, "3"]
     region_radius: float
+
+    @property
+    def sure_depths(self) -> list[Float[Tensor, "height width"]]:
+        """Depths sure enough to call what lies before them empty; 0 elsewhere."""
+        maps = zip(self.depths, self.confidences, strict=True)
+        return [torch.where(confidence > SURE, depth, 0.0) for depth, confidence in maps]
 
 
 def measurements(
@@ -55,7 +64,8 @@ def measurements(
         certain=[on if o is None else o for o, on in zip(outlines, subject, strict=True)],
         masks=[None if v.mask is None else torch.tensor(v.mask, device=device) for v in views],
         outlines=outlines,
-        depths=[_sure_depth(map_, device) for map_ in stereo.depth_maps],
+        depths=[torch.tensor(map_.depth, device=device) for map_ in stereo.depth_maps],
+        confidences=[torch.tensor(map_.confidence, device=device) for map_ in stereo.depth_maps],
         positions=torch.tensor(points.positions, device=device),
         normals=torch.tensor(points.normals, device=device),
         colours=torch.tensor(points.colours_srgb, device=device),
@@ -86,11 +96,6 @@ def carried(
         region_centre=middle,
         region_radius=scale,
     )
-
-
-def _sure_depth(map_: DepthMap, device: torch.device) -> Float[Tensor, "height width"]:
-    """Depths sure enough to call what lies before them empty; 0 elsewhere."""
-    return torch.tensor(np.where(map_.confidence > SURE, map_.depth, 0), device=device)
 
 
 def _outline_or_none(

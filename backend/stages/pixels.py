@@ -29,7 +29,7 @@ def worthy_pixels(scene: Measurements) -> Pixels:
     """On and just around the subject: where the mask is, or where something was measured."""
     near = [
         outline < 8 if outline is not None else F.max_pool2d((depth > 0).float()[None], 5, 1, 2)[0] > 0
-        for outline, depth in zip(scene.outlines, scene.depths, strict=True)
+        for outline, depth in zip(scene.outlines, scene.sure_depths, strict=True)
     ]
     return _pixels_at(scene, near)
 

@@ -14,6 +14,7 @@ import torch
 from ..maths.grid import refined, spacing
 from ..scene import Decision, Progress, Region, StereoResult, View, within
 from .deadline import Clock, GridCost, deadline_after, finest_grid, predicted_s
+from .inner_outlines import FarSide, decision, far_sides
 from .linear_fit import LinearConfig, fit_level, start
 from .measurements import Measurements, carried, measurements
 from .render_fit import RenderConfig, refine
@@ -70,6 +71,7 @@ def fit_surface(
         distance = start(scene, radius, config.levels[0])
     total = sum(config.steps) + 10 * len(config.levels)
     done, rendered, taken_back = 0, 0, 0
+    bridges: list[list[FarSide]] = []
     for wanted, rounds, steps in zip(config.levels, config.rounds, config.steps, strict=True):
         nodes = finest_grid(costs, len(distance), wanted, deadline.left_s())
         if nodes == len(distance) < wanted:
@@ -77,7 +79,11 @@ def fit_surface(
         progress(done / total, f"fitting points on a grid of {nodes}^3")
         began_s = clock()
         with torch.no_grad():
-            distance = fit_level(scene, refined(distance, nodes), radius, rounds, config.linear)
+            # a bridge is known by a field that has been fitted
+            if config.linear.inner_outlines and done:
+                bridges.append(far_sides(scene, distance))
+            far = bridges[-1] if bridges else ()
+            distance = fit_level(scene, refined(distance, nodes), radius, rounds, config.linear, far)
         done += 10
         show(Surface(distance=distance.cpu().numpy(), grid_from_world=frame.object_from_world))
         costs.append(GridCost(nodes=nodes, seconds=clock() - began_s))
@@ -89,7 +95,7 @@ def fit_surface(
             taken_back += better.taken_back
             done += steps
     made = _decisions(scene, frame, config, depth, nodes=len(distance), rendered=rendered)
-    made = (*made, _of_rendering(config, rendered, taken_back))
+    made = (*made, decision(bridges), _of_rendering(config, rendered, taken_back))
     if config.budget_s is not None:
         used_s = config.budget_s - deadline.left_s()
         made = (*made, _of_budget(config.budget_s, used_s, config, costs, rendered))

@@ -124,6 +124,7 @@ def seen(
         backdrops=nothing if backdrops is None else backdrops,
         certain=edges,
         depths=[torch.zeros(HEIGHT, WIDTH)] * len(cameras),
+        confidences=[torch.zeros(HEIGHT, WIDTH)] * len(cameras),
         positions=measured,
         normals=normals,
         colours=normals.abs(),

@@ -83,6 +83,7 @@ def seen(azimuths_deg: list[float], back: float, *, measured_from: float = 0.4) 
         backdrops=[None] * len(cameras),
         certain=list(edges),
         depths=[torch.zeros(SIZE, SIZE)] * len(cameras),
+        confidences=[torch.zeros(SIZE, SIZE)] * len(cameras),
         positions=positions[chosen],
         normals=normals[chosen],
         colours=torch.zeros(count, 3),

@@ -1,0 +1,180 @@
+"""Outlines inside the subject: where one part of it hides another, photographs show a line.
+
+Beside such a line, mostly one photograph alone sees what is behind, so nothing is measured there, and a
+smooth field bridges the way from what is in front to what is behind: on all subjects that we looked at, most
+of what is wrong is such a bridge. Where the line is, the photograph itself tells: pixels without a
+measurement belong with those measured ones that a random walk finds which hardly ever crosses contrasts.
+Where on one side of a line walks end much farther off than on the other, and the field lies before that,
+nothing is there.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from jaxtyping import Bool, Float, Float32, Float64
+from scipy.ndimage import binary_erosion, binary_opening, label
+from torch import Tensor
+
+from ..maths.geometry import Pinhole, pixel_centres, ray_directions
+from ..maths.grid import locate, read, spacing, value_and_gradient
+from ..maths.random_walk import WalkEnds, walk_ends
+from ..maths.rays import first_crossing, sphere_entry
+from ..scene import Decision
+from .measurements import Measurements
+
+_AROUND = 1.75
+"""Radius of a ball around the grid's cube."""
+_PIXELS = 30_000
+"""Of a picture that walks go over, at most: time grows faster than they do."""
+_LEAST_CONFIDENCE = 0.1
+"""Of a depth that a walk may end at."""
+_BY_FIELD = 0.01
+"""How readily a walk ends where nothing was measured, at the field's own depth, beside confidence; less where
+the field turns away, for bridges do: nothing below a cosine of 0.3, all from 0.8 on."""
+_USUAL = 0.85
+"""Of the median difference between neighbouring pixels: what differs by as much is still alike."""
+_LEAST_CONTRAST = 0.004
+"""Of that, in sRGB values from 0 to 1: eight bits' steps."""
+_STEP = 0.05
+"""Between the depths at which walks from two neighbouring pixels end, in half widths of the grid, about a
+fiftieth of the diagonal: a line parts them."""
+_DOUBT = 0.7
+"""How many spreads nearer the far side may be; and how steep it may rise towards the line."""
+_MARGIN = 0.025
+"""In half widths of the grid: by less, the field does not lie before what is behind."""
+_THICK_PX = 3
+"""What is narrower is where the line is, not what is beside it."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class FarSide:
+    """What a photograph tells to be empty beside lines inside the subject."""
+
+    camera: Pinhole
+    """Of a smaller picture."""
+    depth: Float[Tensor, "height width"]
+    """Along the axis, up to which a pixel's ray is empty; 0 where nothing is told."""
+
+
+def far_sides(scene: Measurements, distance: Float[Tensor, "nodes nodes nodes"]) -> list[FarSide]:
+    """For each photograph that knows its subject, where a field of the scene's frame bridges a gap."""
+    views = zip(scene.cameras, scene.images, scene.certain, scene.depths, scene.confidences, strict=True)
+    found = []
+    for camera, image, outline, depth, confidence in views:
+        if outline is None:
+            continue
+        small = _smaller(camera)
+        size = (small.height, small.width)
+        seen = _seen(small, distance)
+        on = seen.hit & (_at_size(outline, size) < 0).numpy()
+        sure = _at_size(confidence, size).numpy()
+        measured = _at_size(depth, size).numpy()
+        is_known = (measured > 0) & (sure > _LEAST_CONFIDENCE)
+        picture = F.interpolate(image[None], size=size, mode="area")[0].permute(1, 2, 0).cpu().numpy()
+        ends = walk_ends(
+            picture,
+            on,
+            np.where(is_known, measured, seen.depth),
+            np.where(is_known, sure, _BY_FIELD * seen.facing),
+            contrast=_contrast(picture, on),
+        )
+        empty = _empty(ends, on, seen.depth, float(small.intrinsics[0, 0]))
+        found.append(FarSide(camera=small, depth=torch.tensor(empty, device=distance.device)))
+    return found
+
+
+def decision(levels: Sequence[Sequence[FarSide]]) -> Decision:
+    """In how many photographs something was told of the field at any level, for the report."""
+    told = sum(any(bool((side.depth > 0).any()) for side in of_view) for of_view in zip(*levels, strict=True))
+    what = "outlines inside the subject"
+    if not any(levels):
+        return Decision(what=what, choice="left out", because="not asked for, or no silhouettes are known")
+    because = (
+        f"in {told} of {len(levels[0])} photographs a line parts near from far, and the field was a bridge"
+    )
+    return Decision(what=what, choice="used" if told else "left out", because=because)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Seen:
+    """A field as a camera sees it."""
+
+    hit: Bool[np.ndarray, "height width"]
+    depth: Float64[np.ndarray, "height width"]
+    """Along the axis; 0 where the field is missed."""
+    facing: Float64[np.ndarray, "height width"]
+    """0 where it turns away, 1 where it faces the camera."""
+
+
+def _smaller(camera: Pinhole) -> Pinhole:
+    share = min(math.sqrt(_PIXELS / (camera.width * camera.height)), 1.0)
+    return camera.scaled(max(round(share * camera.width), 1), max(round(share * camera.height), 1))
+
+
+def _at_size(image: Float[Tensor, "height width"], size: tuple[int, int]) -> Float[Tensor, "rows columns"]:
+    return F.interpolate(image[None, None], size=size, mode="nearest-exact")[0, 0].cpu()
+
+
+def _seen(camera: Pinhole, distance: Float[Tensor, "nodes nodes nodes"]) -> _Seen:
+    nodes, shape = len(distance), (camera.height, camera.width)
+    pixels = pixel_centres(camera.width, camera.height, distance.device).reshape(-1, 2)
+    along_axis = ray_directions(camera, pixels)
+    directions = F.normalize(along_axis, dim=-1)
+    origins = camera.position.expand_as(directions)
+    entry = sphere_entry(origins / _AROUND, directions) * _AROUND
+    crossing = first_crossing(
+        lambda points: read(distance, points),
+        origins,
+        directions,
+        entry,
+        reach=2 * _AROUND,
+        shortest=0.5 * spacing(nodes),
+        steps=60,
+    )
+    _, gradient = value_and_gradient(distance, locate(origins + crossing.along[:, None] * directions, nodes))
+    cosine = -(F.normalize(gradient, dim=-1) * directions).sum(dim=-1)
+    facing = ((cosine - 0.3) / 0.5).clamp(0, 1).square()
+    depth = torch.where(crossing.hit, crossing.along / along_axis.norm(dim=-1), 0.0)
+
+    def as_picture(values: Tensor) -> Float64[np.ndarray, "height width"]:
+        return np.asarray(values.cpu().double().numpy().reshape(shape))
+
+    hit = crossing.hit.cpu().numpy().reshape(shape)
+    return _Seen(hit=hit, depth=as_picture(depth), facing=as_picture(facing))
+
+
+def _contrast(picture: Float32[np.ndarray, "height width 3"], on: Bool[np.ndarray, "height width"]) -> float:
+    """How much neighbours on the subject may differ and still be alike: less than its texture does."""
+    difference = np.linalg.norm(np.diff(picture, axis=1), axis=2)[on[:, 1:] & on[:, :-1]]
+    usual = float(np.median(difference)) if len(difference) else 0.0
+    return max(_USUAL * usual, _LEAST_CONTRAST)
+
+
+def _empty(
+    ends: WalkEnds,
+    on: Bool[np.ndarray, "height width"],
+    field_depth: Float64[np.ndarray, "height width"],
+    focal_px: float,
+) -> Float32[np.ndarray, "height width"]:
+    """Depth up to which rays are empty, of pixels beside a line where the field lies before that; else 0."""
+    rise = ends.distance_px * ends.mean / focal_px
+    clear = ends.mean - _DOUBT * np.hypot(ends.spread, rise) - _MARGIN
+    bridged = on & (clear > field_depth)  # never where an end is not a number
+    pieces, _ = label(bridged, np.ones((3, 3)))
+    beside = np.unique(pieces[_beyond_a_line(ends.mean) & binary_erosion(on, iterations=2)])
+    kept = binary_opening(np.isin(pieces, beside[beside > 0]), np.ones((_THICK_PX, _THICK_PX)))
+    return np.where(kept, clear, 0.0).astype(np.float32)
+
+
+def _beyond_a_line(mean: Float64[np.ndarray, "height width"]) -> Bool[np.ndarray, "height width"]:
+    """The farther of each two pixels side by side, or one above the other, with a step between."""
+    beyond = np.zeros(mean.shape, np.bool_)
+    for grid, far in ((mean, beyond), (mean.T, beyond.T)):
+        step = np.diff(grid, axis=1)
+        far[:, 1:] |= step > _STEP
+        far[:, :-1] |= step < -_STEP
+    return beyond
