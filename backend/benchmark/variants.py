@@ -98,5 +98,10 @@ VARIANTS = (
     # what `fast` alone has
     Variant(name="fast, as it is", preset="fast"),
     Variant(name="fast, leverage ignored", changes={"stereo.free_leverage": None}, preset="fast"),
+    Variant(
+        name="fast, without outlines inside the subject",
+        changes={"train.linear.inner_outlines": False},
+        preset="fast",
+    ),
     Variant(name="fast at full size", changes={"stereo.first_pixel_size": 1}, preset="fast"),
 )

@@ -25,9 +25,8 @@ from ..maths.random_walk import WalkEnds, walk_ends
 from ..maths.rays import first_crossing, sphere_entry
 from ..scene import Decision
 from .measurements import Measurements
+from .silhouettes import AROUND
 
-_AROUND = 1.75
-"""Radius of a ball around the grid's cube."""
 _PIXELS = 30_000
 """Of a picture that walks go over, at most: time grows faster than they do."""
 _LEAST_CONFIDENCE = 0.1
@@ -69,8 +68,8 @@ def far_sides(scene: Measurements, distance: Float[Tensor, "nodes nodes nodes"])
             continue
         small = _smaller(camera)
         size = (small.height, small.width)
-        seen = _seen(small, distance)
-        on = seen.hit & (_at_size(outline, size) < 0).numpy()
+        seen = _seen(small, _at_size(outline, size) < 0, distance)
+        on = seen.depth > 0
         sure = _at_size(confidence, size).numpy()
         measured = _at_size(depth, size).numpy()
         is_known = (measured > 0) & (sure > _LEAST_CONFIDENCE)
@@ -101,11 +100,10 @@ def decision(levels: Sequence[Sequence[FarSide]]) -> Decision:
 
 @dataclass(frozen=True, kw_only=True)
 class _Seen:
-    """A field as a camera sees it."""
+    """A field as a camera sees it; 0 where it is missed or not looked at."""
 
-    hit: Bool[np.ndarray, "height width"]
     depth: Float64[np.ndarray, "height width"]
-    """Along the axis; 0 where the field is missed."""
+    """Along the axis."""
     facing: Float64[np.ndarray, "height width"]
     """0 where it turns away, 1 where it faces the camera."""
 
@@ -119,32 +117,37 @@ def _at_size(image: Float[Tensor, "height width"], size: tuple[int, int]) -> Flo
     return F.interpolate(image[None, None], size=size, mode="nearest-exact")[0, 0].cpu()
 
 
-def _seen(camera: Pinhole, distance: Float[Tensor, "nodes nodes nodes"]) -> _Seen:
-    nodes, shape = len(distance), (camera.height, camera.width)
-    pixels = pixel_centres(camera.width, camera.height, distance.device).reshape(-1, 2)
-    along_axis = ray_directions(camera, pixels)
+def _seen(
+    camera: Pinhole, where: Bool[Tensor, "height width"], distance: Float[Tensor, "nodes nodes nodes"]
+) -> _Seen:
+    nodes, looked_at = len(distance), where.to(distance.device)
+    along_axis = ray_directions(
+        camera, pixel_centres(camera.width, camera.height, distance.device)[looked_at]
+    )
     directions = F.normalize(along_axis, dim=-1)
     origins = camera.position.expand_as(directions)
-    entry = sphere_entry(origins / _AROUND, directions) * _AROUND
+    entry = sphere_entry(origins / AROUND, directions) * AROUND
     crossing = first_crossing(
         lambda points: read(distance, points),
         origins,
         directions,
         entry,
-        reach=2 * _AROUND,
+        reach=2 * AROUND,
         shortest=0.5 * spacing(nodes),
         steps=60,
     )
-    _, gradient = value_and_gradient(distance, locate(origins + crossing.along[:, None] * directions, nodes))
+    points = origins + crossing.along[:, None] * directions
+    _, gradient = value_and_gradient(distance, locate(points, nodes))
     cosine = -(F.normalize(gradient, dim=-1) * directions).sum(dim=-1)
-    facing = ((cosine - 0.3) / 0.5).clamp(0, 1).square()
     depth = torch.where(crossing.hit, crossing.along / along_axis.norm(dim=-1), 0.0)
+    facing = torch.where(crossing.hit, ((cosine - 0.3) / 0.5).clamp(0, 1).square(), 0.0)
 
-    def as_picture(values: Tensor) -> Float64[np.ndarray, "height width"]:
-        return np.asarray(values.cpu().double().numpy().reshape(shape))
+    def as_picture(values: Float[Tensor, "pixels"]) -> Float64[np.ndarray, "height width"]:
+        out = np.zeros(where.shape)
+        out[where.numpy()] = values.cpu().numpy()
+        return out
 
-    hit = crossing.hit.cpu().numpy().reshape(shape)
-    return _Seen(hit=hit, depth=as_picture(depth), facing=as_picture(facing))
+    return _Seen(depth=as_picture(depth), facing=as_picture(facing))
 
 
 def _contrast(picture: Float32[np.ndarray, "height width 3"], on: Bool[np.ndarray, "height width"]) -> float:

@@ -13,7 +13,7 @@ from ..maths.grid import node_positions, read, spacing
 from ..maths.rays import first_crossing, points_along, sphere_entry, sphere_span
 from .measurements import Measurements
 
-_AROUND = 1.75
+AROUND = 1.75
 """Radius of a ball around the grid's cube."""
 
 
@@ -66,7 +66,7 @@ def silhouette_rays(scene: Measurements, nodes: int) -> SilhouetteRays:
         meets = _meets_region(scene, camera, directions)
         rows, columns, directions = rows[meets], columns[meets], directions[meets]
         origins = camera.position.expand_as(directions)
-        entry = sphere_entry(origins / _AROUND, directions) * _AROUND
+        entry = sphere_entry(origins / AROUND, directions) * AROUND
         inside_px = -outline[rows * step, columns * step]
         parts.append([origins, directions, entry, inside_px / camera.intrinsics[0, 0]])
     origins, directions, entry, from_outline = (torch.cat(column) for column in zip(*parts, strict=True))
@@ -100,7 +100,7 @@ def _allowed(
     rays: SilhouetteRays, bound: Float[Tensor, "nodes nodes nodes"]
 ) -> tuple[Float[Tensor, "rays places"], Int[Tensor, "rays places"]]:
     """Places along each ray, and how many up to each may be inside."""
-    along = rays.entry[:, None] + torch.linspace(0, 2 * _AROUND, 2 * len(bound), device=bound.device)
+    along = rays.entry[:, None] + torch.linspace(0, 2 * AROUND, 2 * len(bound), device=bound.device)
     points = points_along(rays.origins, rays.directions, along)
     return along, (read(bound, points.reshape(-1, 3)) < 0).reshape(along.shape).cumsum(dim=1)
 
@@ -124,7 +124,7 @@ def inside_along(
     lost = torch.nonzero(~known)[:, 0]
     origins, directions, entry = rays.origins[lost], rays.directions[lost], rays.entry[lost]
     crossing = first_crossing(
-        value, origins, directions, entry, reach=2 * _AROUND, shortest=shortest, steps=60
+        value, origins, directions, entry, reach=2 * AROUND, shortest=shortest, steps=60
     )
     found = torch.where(crossing.hit, crossing.along + 0.5 * shortest, torch.inf)
     return before.index_copy(0, lost, found)
