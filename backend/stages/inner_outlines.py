@@ -86,15 +86,13 @@ def far_sides(scene: Measurements, distance: Float[Tensor, "nodes nodes nodes"])
     return found
 
 
-def decision(levels: Sequence[Sequence[FarSide]]) -> Decision:
-    """In how many photographs something was told of the field at any level, for the report."""
-    told = sum(any(bool((side.depth > 0).any()) for side in of_view) for of_view in zip(*levels, strict=True))
+def decision(far: Sequence[FarSide]) -> Decision:
+    """In how many photographs something was told, for the report."""
+    told = sum(bool((side.depth > 0).any()) for side in far)
     what = "outlines inside the subject"
-    if not any(levels):
+    if not far:
         return Decision(what=what, choice="left out", because="not asked for, or no silhouettes are known")
-    because = (
-        f"in {told} of {len(levels[0])} photographs a line parts near from far, and the field was a bridge"
-    )
+    because = f"in {told} of {len(far)} photographs a line parts near from far, and the field was a bridge"
     return Decision(what=what, choice="used" if told else "left out", because=because)
 
 

@@ -71,7 +71,7 @@ def fit_surface(
         distance = start(scene, radius, config.levels[0])
     total = sum(config.steps) + 10 * len(config.levels)
     done, rendered, taken_back = 0, 0, 0
-    bridges: list[list[FarSide]] = []
+    told: list[FarSide] = []
     for wanted, rounds, steps in zip(config.levels, config.rounds, config.steps, strict=True):
         nodes = finest_grid(costs, len(distance), wanted, deadline.left_s())
         if nodes == len(distance) < wanted:
@@ -79,10 +79,10 @@ def fit_surface(
         progress(done / total, f"fitting points on a grid of {nodes}^3")
         began_s = clock()
         with torch.no_grad():
-            # a bridge is known by a field that has been fitted
-            if config.linear.inner_outlines and done:
-                bridges.append(far_sides(scene, distance))
-            far = bridges[-1] if bridges else ()
+            # bridges are seen in the first grid's field; finer ones than the second go on without them
+            is_second = config.linear.inner_outlines and len(costs) == 2
+            far = far_sides(scene, distance) if is_second else []
+            told += far
             distance = fit_level(scene, refined(distance, nodes), radius, rounds, config.linear, far)
         done += 10
         show(Surface(distance=distance.cpu().numpy(), grid_from_world=frame.object_from_world))
@@ -95,7 +95,7 @@ def fit_surface(
             taken_back += better.taken_back
             done += steps
     made = _decisions(scene, frame, config, depth, nodes=len(distance), rendered=rendered)
-    made = (*made, decision(bridges), _of_rendering(config, rendered, taken_back))
+    made = (*made, decision(told), _of_rendering(config, rendered, taken_back))
     if config.budget_s is not None:
         used_s = config.budget_s - deadline.left_s()
         made = (*made, _of_budget(config.budget_s, used_s, config, costs, rendered))

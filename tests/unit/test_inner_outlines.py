@@ -167,8 +167,8 @@ def test_the_fit_opens_the_gap() -> None:
 def test_the_report_says_how_many_photographs_told() -> None:
     found = far_sides(scene(), bridged())
     nothing = [replace(found[0], depth=torch.zeros_like(found[0].depth))]
-    assert decision([nothing, found]).choice == "used"
-    assert "in 1 of 1" in decision([nothing, found]).because
-    assert decision([nothing]).choice == "left out"
+    assert decision([*nothing, *found]).choice == "used"
+    assert "in 1 of 2" in decision([*nothing, *found]).because
+    assert decision(nothing).choice == "left out"
     assert decision([]).choice == "left out"
     assert math.isfinite(float(found[0].depth.sum()))
