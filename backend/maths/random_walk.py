@@ -52,18 +52,19 @@ def walk_ends(
     edges = coo_array((conducts, (one, other)), shape=(size, size))
     sure = np.where(inside, sureness, 0.0).ravel().astype(np.float64)
     pixels = _answered(edges, sure)
+    if not len(pixels):
+        nothing = np.full(inside.shape, np.nan)
+        return WalkEnds(mean=nothing, spread=nothing, distance_px=nothing)
     edges = (edges + edges.T).tocsr()[pixels][:, pixels]
     sure = sure[pixels]
     place = np.stack(np.divmod(pixels, inside.shape[1]), axis=1).astype(np.float64)
     known = np.where(sure > 0, value.ravel()[pixels], 0.0)
-    middle, centre = _mean(known, sure), place.mean(axis=0) if len(place) else 0.0
-    known, place = known - middle, place - centre
-    found = np.zeros((len(pixels), 5))
-    if len(pixels):
-        system = diags_array(sure + edges.sum(axis=1)) - edges
-        asked = np.column_stack([known, known**2, place, (place**2).sum(axis=1)])
-        solver = splu(system.tocsc(), permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True})
-        found = solver.solve(sure[:, None] * asked)
+    middle = float(known @ sure / sure.sum())
+    known, place = known - middle, place - place.mean(axis=0)
+    system = diags_array(sure + edges.sum(axis=1)) - edges
+    asked = np.column_stack([known, known**2, place, (place**2).sum(axis=1)])
+    solver = splu(system.tocsc(), permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True})
+    found = solver.solve(sure[:, None] * asked)
     mean, square, ends, ends2 = found[:, 0], found[:, 1], found[:, 2:4], found[:, 4]
     distance2 = ends2 - 2 * (place * ends).sum(axis=1) + (place**2).sum(axis=1)
 
@@ -102,7 +103,3 @@ def _answered(edges: coo_array, sure: Float64[np.ndarray, "pixels"]) -> Int64[np
     """Numbers of the pixels from which some known one can be reached."""
     _, piece = connected_components(edges, directed=False)
     return np.flatnonzero(np.bincount(piece, weights=sure)[piece] > 0)
-
-
-def _mean(values: Float64[np.ndarray, "pixels"], sure: Float64[np.ndarray, "pixels"]) -> float:
-    return float(values @ sure / sure.sum()) if len(values) else 0.0

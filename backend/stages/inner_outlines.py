@@ -20,12 +20,11 @@ from scipy.ndimage import binary_erosion, binary_opening, label
 from torch import Tensor
 
 from ..maths.geometry import Pinhole, pixel_centres, ray_directions
-from ..maths.grid import locate, read, spacing, value_and_gradient
+from ..maths.grid import locate, value_and_gradient
 from ..maths.random_walk import WalkEnds, walk_ends
-from ..maths.rays import first_crossing, sphere_entry
 from ..scene import Decision
 from .measurements import Measurements
-from .silhouettes import AROUND
+from .silhouettes import grid_crossing, grid_entry
 
 _PIXELS = 30_000
 """Of a picture that walks go over, at most: time grows faster than they do."""
@@ -118,24 +117,15 @@ def _at_size(image: Float[Tensor, "height width"], size: tuple[int, int]) -> Flo
 def _seen(
     camera: Pinhole, where: Bool[Tensor, "height width"], distance: Float[Tensor, "nodes nodes nodes"]
 ) -> _Seen:
-    nodes, looked_at = len(distance), where.to(distance.device)
+    looked_at = where.to(distance.device)
     along_axis = ray_directions(
         camera, pixel_centres(camera.width, camera.height, distance.device)[looked_at]
     )
     directions = F.normalize(along_axis, dim=-1)
     origins = camera.position.expand_as(directions)
-    entry = sphere_entry(origins / AROUND, directions) * AROUND
-    crossing = first_crossing(
-        lambda points: read(distance, points),
-        origins,
-        directions,
-        entry,
-        reach=2 * AROUND,
-        shortest=0.5 * spacing(nodes),
-        steps=60,
-    )
+    crossing = grid_crossing(distance, origins, directions, grid_entry(origins, directions))
     points = origins + crossing.along[:, None] * directions
-    _, gradient = value_and_gradient(distance, locate(points, nodes))
+    _, gradient = value_and_gradient(distance, locate(points, len(distance)))
     cosine = -(F.normalize(gradient, dim=-1) * directions).sum(dim=-1)
     depth = torch.where(crossing.hit, crossing.along / along_axis.norm(dim=-1), 0.0)
     facing = torch.where(crossing.hit, ((cosine - 0.3) / 0.5).clamp(0, 1).square(), 0.0)

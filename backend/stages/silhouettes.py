@@ -10,10 +10,10 @@ from torch import Tensor
 from ..maths.evidence import half_cell_px, off_silhouette
 from ..maths.geometry import Pinhole, ray_directions
 from ..maths.grid import node_positions, read, spacing
-from ..maths.rays import first_crossing, points_along, sphere_entry, sphere_span
+from ..maths.rays import Crossing, first_crossing, points_along, sphere_entry, sphere_span
 from .measurements import Measurements
 
-AROUND = 1.75
+_AROUND = 1.75
 """Radius of a ball around the grid's cube."""
 
 
@@ -66,7 +66,7 @@ def silhouette_rays(scene: Measurements, nodes: int) -> SilhouetteRays:
         meets = _meets_region(scene, camera, directions)
         rows, columns, directions = rows[meets], columns[meets], directions[meets]
         origins = camera.position.expand_as(directions)
-        entry = sphere_entry(origins / AROUND, directions) * AROUND
+        entry = grid_entry(origins, directions)
         inside_px = -outline[rows * step, columns * step]
         parts.append([origins, directions, entry, inside_px / camera.intrinsics[0, 0]])
     origins, directions, entry, from_outline = (torch.cat(column) for column in zip(*parts, strict=True))
@@ -100,7 +100,7 @@ def _allowed(
     rays: SilhouetteRays, bound: Float[Tensor, "nodes nodes nodes"]
 ) -> tuple[Float[Tensor, "rays places"], Int[Tensor, "rays places"]]:
     """Places along each ray, and how many up to each may be inside."""
-    along = rays.entry[:, None] + torch.linspace(0, 2 * AROUND, 2 * len(bound), device=bound.device)
+    along = rays.entry[:, None] + torch.linspace(0, 2 * _AROUND, 2 * len(bound), device=bound.device)
     points = points_along(rays.origins, rays.directions, along)
     return along, (read(bound, points.reshape(-1, 3)) < 0).reshape(along.shape).cumsum(dim=1)
 
@@ -113,21 +113,39 @@ def inside_along(
     `before` is the same of an earlier field, or infinite: where this one is inside there too, nothing is
     searched. A field changes little from round to round, so hardly a ray has to be traced again.
     """
-    shortest = 0.5 * spacing(distance.shape[0])
-
-    def value(points: Float[Tensor, "points 3"]) -> Float[Tensor, "points"]:
-        return read(distance, points)
-
     known = before.isfinite()
     at = torch.where(known, before, 0.0)[:, None]
-    known = known & (value(rays.origins + at * rays.directions) < 0)
+    known = known & (read(distance, rays.origins + at * rays.directions) < 0)
     lost = torch.nonzero(~known)[:, 0]
     origins, directions, entry = rays.origins[lost], rays.directions[lost], rays.entry[lost]
-    crossing = first_crossing(
-        value, origins, directions, entry, reach=2 * AROUND, shortest=shortest, steps=60
-    )
-    found = torch.where(crossing.hit, crossing.along + 0.5 * shortest, torch.inf)
+    crossing = grid_crossing(distance, origins, directions, entry)
+    found = torch.where(crossing.hit, crossing.along + 0.25 * spacing(len(distance)), torch.inf)
     return before.index_copy(0, lost, found)
+
+
+def grid_entry(
+    origins: Float[Tensor, "rays 3"], directions: Float[Tensor, "rays 3"]
+) -> Float[Tensor, "rays"]:
+    """Where rays (unit directions) come near the grid's cube, as far from their origins."""
+    return sphere_entry(origins / _AROUND, directions) * _AROUND
+
+
+def grid_crossing(
+    distance: Float[Tensor, "nodes nodes nodes"],
+    origins: Float[Tensor, "rays 3"],
+    directions: Float[Tensor, "rays 3"],
+    entry: Float[Tensor, "rays"],
+) -> Crossing:
+    """Where rays meet a field on the grid, from their `grid_entry` on, in steps of half a cell and more."""
+    return first_crossing(
+        lambda points: read(distance, points),
+        origins,
+        directions,
+        entry,
+        reach=2 * _AROUND,
+        shortest=0.5 * spacing(len(distance)),
+        steps=60,
+    )
 
 
 def missing(rays: SilhouetteRays, distance: Float[Tensor, "nodes nodes nodes"]) -> Bool[Tensor, "rays"]:

@@ -51,6 +51,12 @@ def test_a_less_sure_pixel_ends_fewer_walks() -> None:
     assert found.mean[0, 1] == pytest.approx(9 / 3, rel=1e-3)
 
 
+def test_a_diagonal_step_is_half_as_easy() -> None:
+    """Two neighbours at 0 and a diagonal one at 1: half of an edge against two."""
+    found = ends({(0, 0): 1.0, (0, 1): 0.0, (1, 0): 0.0}, np.zeros((2, 2)))
+    assert found.mean[1, 1] == pytest.approx(0.5 / 2.5)
+
+
 def test_values_may_be_shifted_and_scaled() -> None:
     rng = np.random.default_rng(0)
     colours = rng.random((9, 11))
