@@ -14,10 +14,11 @@ from ..presets import Settings
 from ..scene import StereoResult, SurfaceMesh
 from ..stages.report import error_numbers
 from ..stages.surface import Surface
+from ..stages.train import TrainConfig
 from ..workspace import fingerprint
 from .held_out import held_out_fit, known_views
 from .measuring import Measurement, Numbers, case_files, flat_errors, measuring_fingerprint
-from .one_by_one import Placed, Seconds, extract, fit, match, place, surface_configs
+from .one_by_one import Placed, Seconds, extract, fit, match, place
 from .suites import Case
 from .summary import Column
 from .variants import Variant
@@ -66,8 +67,8 @@ def at_once(work: Callable[..., tuple[Measurement, Known]], *arguments: Any) -> 
 
 
 def is_random(settings: Settings) -> bool:
-    """Whether another seed gives another surface: only rendering draws by lot."""
-    return any(surface_configs(settings)[1].steps)
+    """Whether another seed gives another surface: rendering draws by lot, the linear fit does not."""
+    return not isinstance(settings.train, TrainConfig) or any(settings.train.steps)
 
 
 def inputs_of(case: Case, folder: Path, variant: Variant, device: str, machine: Mapping[str, object]) -> str:
@@ -95,13 +96,12 @@ def measure_variants(
     known: dict[object, Step[Any]] = {}
     for variant in variants:
         settings = variant.settings
-        stereo_config, train = surface_configs(settings)
         for seed in range(num_seeds if is_random(settings) else 1):
             if (variant.name, seed) in done:
                 yield done[variant.name, seed]
                 continue
-            of_stereo = (settings.photos, stereo_config, variant.with_masks, variant.cameras_doubted)
-            of_surface = (of_stereo, train, seed)
+            of_stereo = (settings.photos, settings.stereo, variant.with_masks, variant.cameras_doubted)
+            of_surface = (of_stereo, settings.train, seed)
             before = Known(stereo=known.get(of_stereo), surface=known.get(of_surface))
             measurement, after = alone(measure_variant, case, folder, variant, seed, device, before)
             if after.stereo is not None:

@@ -10,6 +10,7 @@ from typing import TypeVar
 
 import torch
 
+from ..pipeline import fit_by_settings
 from ..presets import Settings
 from ..scene import Region, SolvedCameras, StereoResult, SurfaceMesh, View, no_progress
 from ..stages.camera_refinement import match_solved, with_refined
@@ -17,9 +18,7 @@ from ..stages.cameras import CamerasConfig, solve_cameras
 from ..stages.mesh import extract_mesh
 from ..stages.photos import PhotosConfig, load_photos
 from ..stages.region import find_region
-from ..stages.stereo_config import StereoConfig
 from ..stages.surface import ShowSurface, Surface, show_nothing
-from ..stages.train import TrainConfig, fit_surface
 from .suites import Case, image_paths
 
 T = TypeVar("T")
@@ -78,17 +77,14 @@ def place(case: Case, folder: Path, indices: tuple[int, ...], settings: Settings
     return Placed(solved=solved, region=region)
 
 
-def surface_configs(settings: Settings) -> tuple[StereoConfig, TrainConfig]:
-    """Of stereo and field in settings of the default method. TypeError where they are another's."""
-    if settings.stereo is None or not isinstance(settings.train, TrainConfig):
-        raise TypeError(f"not the settings of a surface from stereo: {settings.train}")
-    return settings.stereo, settings.train
-
-
 def match(placed: Placed, settings: Settings, device: torch.device) -> tuple[StereoResult, Seconds]:
-    """Depth maps and points, and the seconds that they took. Raises ReconstructionError."""
-    stereo, _ = surface_configs(settings)
-    work = partial(match_solved, placed.solved, placed.region, stereo, device=device)
+    """Depth maps and points, and the seconds that they took.
+
+    Raises ReconstructionError, and ValueError where the settings are those of a method without points.
+    """
+    if settings.stereo is None:
+        raise ValueError(f"these settings ask for no points: {settings.train}")
+    work = partial(match_solved, placed.solved, placed.region, settings.stereo, device=device)
     return _timed(partial(work, progress=no_progress))
 
 
@@ -102,8 +98,7 @@ def fit(
     show: ShowSurface = show_nothing,
 ) -> tuple[Surface, Seconds]:
     """The field, and the seconds that it took. Raises ReconstructionError."""
-    _, train = surface_configs(settings)
-    work = partial(fit_surface, placed.views, placed.region, stereo, train, show=show)
+    work = partial(fit_by_settings, placed.views, placed.region, stereo, settings.train, show=show)
     generator = torch.Generator().manual_seed(seed)
     return _timed(partial(work, device=device, generator=generator, progress=no_progress))
 

@@ -4,24 +4,24 @@ import math
 import statistics
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
 
 from ..machine import choose_device, peak_memory_bytes, set_up_torch
-from ..presets import PRESETS, Settings
+from ..presets import Settings
 from ..stages.surface import Surface
-from .one_by_one import extract, fit, match, place, surface_configs
+from ..stages.train import TrainConfig
+from .one_by_one import extract, fit, match, place
 from .suites import Case
 from .summary import Column, markdown
+from .variants import Variant
 
 LARGEST_LINEAR = 1.1
 """An exponent that may still be linear: over four times the size, 15 % off in time is a tenth."""
 
 _NUM_VIEWS = 6
 """Where their number is not what changes."""
-_BALANCED = PRESETS["balanced"]
-_STEREO, _TRAIN = surface_configs(_BALANCED)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,21 +42,23 @@ class Cost:
     numbers: Mapping[str, float | None]
 
 
+def _balanced(setting: str, value: object) -> Settings:
+    return Variant(name=setting, preset="balanced", changes={setting: value}).settings
+
+
 def _of_views(num_views: int) -> Setup:
     # Each is compared with two others whatever their number, so that the work for one view stays the same.
-    stereo = replace(_STEREO, num_sources=2)
-    return Setup(num_views=num_views, settings=replace(_BALANCED, stereo=stereo))
+    return Setup(num_views=num_views, settings=_balanced("stereo.num_sources", 2))
 
 
 def _of_pixels(max_side_px: int) -> Setup:
-    photos = replace(_BALANCED.photos, max_side_px=max_side_px)
-    return Setup(num_views=_NUM_VIEWS, settings=replace(_BALANCED, photos=photos))
+    return Setup(num_views=_NUM_VIEWS, settings=_balanced("photos.max_side_px", max_side_px))
 
 
 def _of_nodes(nodes: int) -> Setup:
-    levels = (*_TRAIN.levels[:-1], nodes)
-    train = replace(_TRAIN, levels=levels, steps=(0,) * len(levels))
-    return Setup(num_views=_NUM_VIEWS, settings=replace(_BALANCED, train=train))
+    return Setup(
+        num_views=_NUM_VIEWS, settings=_balanced("train.levels", (*TrainConfig().levels[:-1], nodes))
+    )
 
 
 SWEEPS = MappingProxyType(
@@ -72,7 +74,6 @@ COLUMNS = (
     Column(heading="stereo s", number="stereo_s", digits=2),
     Column(heading="field s", number="train_s", digits=2),
     Column(heading="of it the finest grid s", number="finest_grid_s", digits=2),
-    Column(heading="of it rendering s", number="rendering_s", digits=2),
     Column(heading="mesh s", number="mesh_s", digits=2),
     Column(heading="peak memory GB", number="peak_memory_bytes", digits=2, scale=1e-9),
     Column(heading="of it for the work GB", number="work_memory_bytes", digits=2, scale=1e-9),
@@ -97,7 +98,6 @@ def measure(case: Case, folder: Path, setup: Setup, device_kind: str) -> Cost:
 
     stereo, stereo_took = match(placed, settings, device)
     surface, train_took = fit(placed, stereo, settings, seed=0, device=device, show=note_time)
-    rendering_s = time.perf_counter() - fitted_at_s[-1]
     _, mesh_took = extract(placed, stereo, surface, settings)
     peak = peak_memory_bytes()
     camera = placed.views[0].camera
@@ -111,7 +111,6 @@ def measure(case: Case, folder: Path, setup: Setup, device_kind: str) -> Cost:
             "stereo_s": stereo_took.wall,
             "train_s": train_took.wall,
             "finest_grid_s": fitted_at_s[-1] - fitted_at_s[-2],
-            "rendering_s": rendering_s if surface_configs(settings)[1].steps[-1] else None,
             "mesh_s": mesh_took.wall,
             "peak_memory_bytes": peak,
             "work_memory_bytes": None if peak is None or held is None else peak - held,

@@ -7,6 +7,9 @@ from typing import Any
 from ..presets import PRESETS, Settings
 from ..stages.unseen_side import LEAST_RADIUS
 
+_STEPS: Mapping[str, object] = {"train.steps": (0, 0, 100)}
+_SHORT: Mapping[str, object] = {"train.steps": 400}
+"""Of the network's 2000: then the course of its rates is a fifth as long, not cut off."""
 _NEXT_TO_NOTHING = 1e-6
 """For weights of the linear fit that replace the prior's: at 0 a node would have none, and no value."""
 
@@ -89,7 +92,15 @@ VARIANTS = (
     ),
     Variant(name="all rounds", changes={"train.linear.settled": 0.0}),
     Variant(name="five rounds", changes={"train.rounds": (5, 5, 5)}),
-    Variant(name="with 100 steps of rendering", changes={"train.steps": (0, 0, 100)}),
+    Variant(name="with 100 steps of rendering", changes=_STEPS),
+    Variant(
+        name="with 100 steps, Taylor residual at queries alone",
+        changes={**_STEPS, "train.render.at_point": 0.0},
+    ),
+    Variant(
+        name="with 100 steps, Taylor residual at points alone",
+        changes={**_STEPS, "train.render.at_query": 0.0},
+    ),
     # the mesh, and cameras
     Variant(name="floating pieces kept", changes={"mesh.smallest_piece": 0.0}),
     Variant(name="without subdivision", changes={"mesh.subdivided": False}),
@@ -104,4 +115,26 @@ VARIANTS = (
         preset="fast",
     ),
     Variant(name="fast at full size", changes={"stereo.first_pixel_size": 1}, preset="fast"),
+    # what SparseCraft asks of points
+    Variant(name="sparsecraft, 400 steps", changes=_SHORT, preset="sparsecraft"),
+    Variant(
+        name="sparsecraft, Taylor residual at queries alone",
+        changes={**_SHORT, "train.weights.at_point": 0.0},
+        preset="sparsecraft",
+    ),
+    Variant(
+        name="sparsecraft, Taylor residual at points alone",
+        changes={**_SHORT, "train.weights.at_query": 0.0},
+        preset="sparsecraft",
+    ),
+    Variant(
+        name="sparsecraft, without colour at points",
+        changes={**_SHORT, "train.weights.point_colours": 0.0},
+        preset="sparsecraft",
+    ),
+    Variant(
+        name="sparsecraft, without points",
+        changes={**_SHORT, "train.weights.points": 0.0},
+        preset="sparsecraft",
+    ),
 )

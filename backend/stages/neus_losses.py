@@ -43,6 +43,10 @@ class Weights:
     """Of masks, where there are some."""
     points: float = 0.0
     """Of both Taylor residuals at the end of the run; they begin at a thousandth. 0 to leave points out."""
+    at_query: float = 1.0
+    """Of the residual with the query's own gradient, in units of the weight of points."""
+    at_point: float = 1.0
+    """Of that with the point's normal, in the same."""
     point_colours: float = 0.5
     """Of the albedo at points, in units of the weight of points; only where colour is split."""
     gloss: float = 0.01
@@ -173,7 +177,7 @@ def point_loss(
     at_query = losses.taylor_at_query(value[:count], gradient[:count], p - q)
     normal = losses.length(gradient[count:])[:, None] * measured.normals[nearest]
     at_point = losses.taylor_at_point(value[:count], normal, p - q)
-    loss = (at_query.abs() + at_point.abs()).mean()
+    loss = (weights.at_query * at_query.abs() + weights.at_point * at_point.abs()).mean()
     if surface.albedo is not None:
         albedo = torch.sigmoid(surface.all_round(p, features[count:]))
         loss = loss + weights.point_colours * (albedo - measured.colours[nearest]).abs().mean()

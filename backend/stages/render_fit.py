@@ -31,6 +31,10 @@ class RenderConfig:
     edges: int = 9
     """Edges of the intervals on each ray."""
     point_queries: int = 4096
+    at_query: float = 1.0
+    """Weight of the Taylor residual with the query's own gradient."""
+    at_point: float = 1.0
+    """Of that with the point's normal."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -157,7 +161,8 @@ def _point_loss(
     value, gradient = field.distance_and_gradient(field.locate(q))
     at_query = losses.taylor_at_query(value, gradient, p - q)
     at_point = losses.taylor_at_point(value, scene.normals[chosen], p - q)
-    both = losses.charbonnier(at_query / h, 0.5) + losses.charbonnier(at_point / h, 0.5)
+    both = config.at_query * losses.charbonnier(at_query / h, 0.5)
+    both = both + config.at_point * losses.charbonnier(at_point / h, 0.5)
     return (scene.confidence[chosen] ** 3 * both).mean()
 
 

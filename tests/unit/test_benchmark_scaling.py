@@ -32,7 +32,7 @@ from tests.synthetic_scene import photographed, ring_cameras, write_scene
 CHANGED = {
     "views": {"stereo.num_sources"},
     "pixels": {"photos.max_side_px"},
-    "nodes": {"train.levels", "train.steps"},
+    "nodes": {"train.levels"},
 }
 SIZES = [3, 6, 12]
 
@@ -44,7 +44,6 @@ def costs_of(power: float, numbers: tuple[str, ...] = ("stereo_s",)) -> list[Cos
             "stereo_s",
             "train_s",
             "finest_grid_s",
-            "rendering_s",
             "mesh_s",
             "peak_memory_bytes",
             "work_memory_bytes",
@@ -123,10 +122,10 @@ def test_what_is_worse_than_linear_is_named() -> None:
 
 def test_of_several_runs_the_least_of_each_number_counts() -> None:
     runs = [
-        Cost(sizes={"views": 3}, numbers={"stereo_s": stereo_s, "mesh_s": mesh_s, "rendering_s": None})
+        Cost(sizes={"views": 3}, numbers={"stereo_s": stereo_s, "mesh_s": mesh_s})
         for stereo_s, mesh_s in ((2.0, 0.5), (1.0, 0.7))
     ]
-    assert least(runs).numbers == {"stereo_s": 1.0, "mesh_s": 0.5, "rendering_s": None}
+    assert least(runs).numbers == {"stereo_s": 1.0, "mesh_s": 0.5}
 
 
 def toy_scene(photos: Path) -> Case:
@@ -150,7 +149,6 @@ def test_a_run_tells_its_sizes_and_what_each_stage_took(
     numbers = {name: value for name, value in cost.numbers.items() if value is not None}
     assert min(numbers[name] for name in ("stereo_s", "mesh_s")) > 0
     assert 0 < numbers["finest_grid_s"] < numbers["train_s"]
-    assert 0 < numbers["rendering_s"] < numbers["train_s"] - numbers["finest_grid_s"]
     assert 0 <= numbers["work_memory_bytes"] < numbers["peak_memory_bytes"]
 
 

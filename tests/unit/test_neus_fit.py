@@ -22,11 +22,14 @@ from backend.scene import (
     no_progress,
     transform_points,
 )
-from backend.stages import field_surface, neus_fit
+from backend.stages import field_surface, neus_fit, render_fit
+from backend.stages.field import SurfaceField
+from backend.stages.measurements import measurements
 from backend.stages.mesh import level_set
-from backend.stages.networks import HashConfig, NetworkConfig
+from backend.stages.networks import HashConfig, NetworkConfig, NeuralSurface
 from backend.stages.neus_fit import NeusConfig, active_levels, finest_detail, fit_neus, rate_share
-from backend.stages.neus_losses import Sampling, Weights
+from backend.stages.neus_losses import Moment, Sampling, Weights, measured_points, point_loss
+from backend.stages.render_fit import RenderConfig
 from backend.stages.surface import ShowSurface, Surface, show_nothing
 from tests.synthetic_scene import (
     CENTRE,
@@ -257,3 +260,33 @@ def test_steps_grow_stay_and_shrink() -> None:
     published = PUBLISHED["sparsecraft-published"]
     shares = [rate_share(published, step / 4000) for step in (0, 1000, 2000, 3000, 4000)]
     assert shares == pytest.approx([1, 1, 1, 0.1**0.5, 0.1])
+
+
+@pytest.mark.parametrize("of", ["network", "grid"])
+def test_each_taylor_residual_has_a_weight_of_its_own(of: str) -> None:
+    """The same draw each time: with a weight of 0 a residual is gone, and the parts add up to the whole."""
+
+    def loss(at_query: float, at_point: float) -> float:
+        generator = torch.Generator().manual_seed(3)
+        if of == "grid":
+            ball = torch.linspace(-1, 1, 24).square()
+            distance = (ball[:, None, None] + ball[:, None] + ball).sqrt() - 0.6
+            field = SurfaceField(
+                distance, band_cells=4, channels=6, view_dependent=False, generator=generator
+            )
+            config = RenderConfig(point_queries=64, at_query=at_query, at_point=at_point)
+            return render_fit._point_loss(field, points, config, generator).item()
+        surface = NeuralSurface(replace(SPARSECRAFT.network, albedo_and_specular=False), generator)
+        weights = Weights(points=1.0, at_query=at_query, at_point=at_point)
+        return point_loss(surface, measured_points(points), moment, SAMPLING, weights, generator).item()
+
+    points = measurements(scene().views, true_region(), exact_stereo(), torch.device("cpu"))
+    moment = Moment(
+        done=1.0, active=2, width=0.1, differenced=True, annealed=1.0, sharpness=torch.tensor(20.0)
+    )
+    at_query, at_point = loss(1.0, 0.0), loss(0.0, 1.0)
+    assert loss(0.0, 0.0) == 0
+    assert min(at_query, at_point) > 0
+    assert at_query != pytest.approx(at_point)
+    assert loss(1.0, 1.0) == pytest.approx(at_query + at_point)
+    assert loss(0.5, 2.0) == pytest.approx(0.5 * at_query + 2 * at_point)
