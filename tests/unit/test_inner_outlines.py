@@ -147,6 +147,40 @@ def test_texture_hides_lines() -> None:
     assert (told(side) > 0).sum() < 20
 
 
+def test_a_line_that_stands_out_of_the_texture_is_found() -> None:
+    """What neighbours differ by everywhere parts nothing, though it is many times what eight bits tell."""
+    generator = torch.Generator().manual_seed(1)
+    plain = scene(contrast=0.6)
+    noise = 0.1 * torch.rand(3, SIZE, SIZE, generator=generator)
+    (side,) = far_sides(replace(plain, images=[plain.images[0] + noise]), bridged())
+    found, (near, far) = told(side) > 0, depths()
+    assert found.sum() > 300
+    assert (far < near)[found].float().mean() > 0.98
+
+
+def test_a_bulge_where_nothing_was_measured_is_no_bridge() -> None:
+    """Walks end on what is around, far behind the bulge, but no line parts one from the other."""
+    near, far = depths()
+    ball = scene(contrast=0.0)
+    middle = torch.tensor([-0.3 + FAR_RADIUS, -0.25, 0.0])
+    rows, columns = torch.meshgrid(torch.arange(SIZE), torch.arange(SIZE), indexing="ij")
+    row, column = divmod(int(far.argmin()), SIZE)
+    around = torch.hypot((rows - row).float(), (columns - column).float()) > 8
+    known = (far < near) & around
+    outline = torch.where(far.isfinite(), -5.0, 5.0)
+    alone = replace(
+        ball,
+        outlines=[outline],
+        certain=[outline],
+        images=[0.3 * far.isfinite().float().expand(3, -1, -1)],
+        depths=[torch.where(known, far, 0.0)],
+        confidences=[0.8 * known],
+    )
+    bulge = (node_positions(NODES, torch.device("cpu")) - middle).norm(dim=-1) - 0.15
+    (side,) = far_sides(alone, torch.minimum(balls()[1], bulge))
+    assert not (told(side) > 0).any()
+
+
 def test_the_fit_opens_the_gap() -> None:
     """Two cells before what was told, on rays where it was: inside as the bridge is left, outside now."""
     setting, before = scene(), bridged()
