@@ -105,6 +105,7 @@ scaling: .venv/.ready .venv-blender/.ready
 	$(BACKEND) -m benchmarks.scaling --case monkey_12 --output $(BENCHMARK)/scaling --scenes $(BENCHMARK)/scenes
 
 points: .venv/.ready
+	$(if $(DATA),,$(error clouds are needed: make points DATA=FOLDER))
 	$(BACKEND) -m benchmarks.points --data $(DATA) --output $(BENCHMARK)/points
 
 .venv/.ready: pyproject.toml constraints.txt

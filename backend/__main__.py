@@ -16,7 +16,7 @@ from .commands.benchmark import add_benchmark, benchmark, positive_seconds
 from .commands.doctor import doctor_on_wire
 from .commands.fit_points import add_fit_points, fit_points_command
 from .commands.reconstruct import EXIT_FINE, EXIT_USER_ERROR, on_terminal, on_wire
-from .commands.rehearse import rehearse
+from .commands.rehearse import ENDS, rehearse
 from .commands.render import add_render, render
 from .waiting import set_waiting_policy
 from .wire.environment import BUILDS
@@ -150,7 +150,7 @@ def _parser() -> argparse.ArgumentParser:
     rehearsal = commands.add_parser("rehearse", help="play a run's messages without running it")
     rehearsal.add_argument("--output", metavar="DIR", type=Path, help="new folder for a toy mesh")
     rehearsal.add_argument("--seconds", metavar="S", type=_number, default=1.0, help="how long it takes (1)")
-    rehearsal.add_argument("--end", choices=("finished", "failed", "crashed"), default="finished")
+    rehearsal.add_argument("--end", choices=ENDS, default="finished")
     add_benchmark(commands.add_parser("benchmark", help="measure speed against error"))
     return parser
 

@@ -13,6 +13,7 @@ from .errors import ErrorCode, ReconstructionError
 
 MIN_PYTHON = (3, 11)
 _PYTHON = "Python"
+_COMPILED = "compiled code"
 DEPENDENCIES = {
     # pillow stands before pycolmap: imported the other way round, the two corrupt memory.
     "numpy": "numpy",
@@ -69,8 +70,8 @@ def not_ready(checks: Sequence[Check]) -> ReconstructionError:
     by_hand = f"; by hand: `{sys.executable} -m pip install {' '.join(packages)}`" if packages else ""
     return ReconstructionError(
         ErrorCode.DEVICE_UNAVAILABLE if is_device else ErrorCode.MISSING_DEPENDENCY,
-        f"This Python can not reconstruct: {first.name} ({first.found}){more}.",
-        f"Choose another Python, or have the add-on install one{by_hand}.",
+        f"This Python cannot reconstruct: {first.name} ({first.found}){more}.",
+        f"Choose another Python, or press Set Up FewView{by_hand}.",
     )
 
 
@@ -80,8 +81,19 @@ def as_text(checks: Sequence[Check]) -> str:
     lines = [f"{'ok ' if check.fine else 'NOT'} {check.name:<{width}} {check.found}" for check in checks]
     if is_ready(checks):
         return "\n".join([*lines, "ready"])
-    remedy = "not ready: run `pip install .` in FewView's folder with this Python: " + sys.executable
-    return "\n".join([*lines, remedy])
+    return "\n".join([*lines, f"not ready: {_by_hand(checks)}"])
+
+
+def _by_hand(checks: Sequence[Check]) -> str:
+    """What to do in a shell about the first thing that is wrong."""
+    first = next(check for check in checks if not check.fine)
+    if first.name == _PYTHON:
+        return f"take Python {'.'.join(map(str, MIN_PYTHON))} or a later one"
+    if first.name in DEPENDENCIES.values():
+        return f"in FewView's folder run `{sys.executable} -m pip install --constraint constraints.txt .`"
+    if first.name == _COMPILED:
+        return "install the packages again; if that does not help, report it with the lines above"
+    return f"update the driver of {first.name}, or compute with `--device cpu`"
 
 
 def as_json(checks: Sequence[Check]) -> str:
@@ -119,7 +131,7 @@ def _check_compiler() -> Check:
     error = max(error_of() for error_of in known)
     seconds = time.perf_counter() - started
     wrong = "" if error < 1e-5 else f", but computes wrongly (error {error:.2g})"
-    return Check(name="compiled code", fine=not wrong, found=f"ready after {seconds:.1f} s{wrong}")
+    return Check(name=_COMPILED, fine=not wrong, found=f"ready after {seconds:.1f} s{wrong}")
 
 
 def _check_devices() -> Iterator[Check]:

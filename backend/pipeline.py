@@ -34,7 +34,7 @@ from .stages.confirmation import unconfirmed
 from .stages.mesh import extract_mesh
 from .stages.neus_fit import NeusConfig, fit_neus
 from .stages.outlines_alone import hollows_filled
-from .stages.photos import load_photos, match_masks, named_photos
+from .stages.photos import load_photos, match_masks, named_photos, without_masks_text
 from .stages.radiance_field import Radiance
 from .stages.radiance_fit import RadianceConfig, fit_radiance
 from .stages.region import find_region
@@ -304,6 +304,8 @@ def _placed(
     photos = this.stage("photos", partial(stages.load_photos, job.images, job.masks, settings.photos))
     # Those of an earlier run are where the folder was then.
     photos = tuple(replace(photo, path=files.photos[photo.name]) for photo in photos)
+    if job.masks and (bare := [photo.name for photo in photos if photo.mask is None]):
+        this.warn(without_masks_text(bare))
     scratch = {"workdir": this.workspace.emptied_sfm_folder(), "seed": job.seed}
     solve = partial(stages.solve_cameras, photos, job.cameras, settings.cameras, **scratch)
     solved = this.stage("cameras", solve)

@@ -150,7 +150,7 @@ class Workspace:
 
         Results of the names in `replaced` that an earlier run left, and this one has not, are removed.
         `frame` is what the property says from then on. Raises ReconstructionError(OUTPUT_UNUSABLE) where an
-        earlier result can not be replaced, as one that is open on Windows; then all are as they were.
+        earlier result cannot be replaced, as one that is open on Windows; then all are as they were.
         """
         parts, earlier = self._emptied(_PARTS), self._emptied(_REPLACED)
         for name, write in writers.items():
@@ -218,7 +218,7 @@ class Workspace:
 
 
 def _write_format(private: Path, note: dict[str, Any]) -> None:
-    """Write format.json whole or not at all; ReconstructionError(OUTPUT_UNUSABLE) where it can not be."""
+    """Write format.json whole or not at all; ReconstructionError(OUTPUT_UNUSABLE) where it cannot be."""
     part = private / (_FORMAT_FILE + ".part")
     try:
         part.write_text(json.dumps(note) + "\n", encoding="utf-8")
@@ -326,7 +326,7 @@ def _not_replaced(result: Path, error: OSError) -> Exception:
     """What to raise where an earlier result stands in the way of a new one."""
     return output_unusable(
         error,
-        f"{result} can not be replaced ({error.strerror or error}); all results are as they were.",
+        f"{result} cannot be replaced ({error.strerror or error}); all results are as they were.",
         f"Close the program that has {result.name} open and start the same command again; finished stages "
         "are kept.",
     )

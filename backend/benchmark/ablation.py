@@ -91,7 +91,7 @@ def measure_variants(
 
     What is `done`, by variant's name and seed, is given back as it is. Stereo and field are used again, with
     what they cost, where their settings are the same. Raises ReconstructionError where the cameras or the
-    region can not be found; what fails later is told in the measurement.
+    region cannot be found; what fails later is told in the measurement.
     """
     known: dict[object, Step[Any]] = {}
     for variant in variants:

@@ -14,6 +14,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import IO, Any
 
+from ..wire.client import own_group
 from .cancelling import CancelRequest
 
 _LOOK_S = 0.1
@@ -47,7 +48,7 @@ def run_child(
         stderr=subprocess.STDOUT if errors_too else None,
         encoding="utf-8",
         errors="replace",
-        **_own_group(),
+        **own_group(),
     )
     try:
         for line in _lines(process, request):
@@ -84,10 +85,6 @@ def _read(stream: IO[str], lines: "queue.SimpleQueue[str | None]") -> None:
 
 if sys.platform == "win32":
 
-    def _own_group() -> dict[str, Any]:
-        """Popen options: it can be ended with its children, and no window opens."""
-        return {"creationflags": subprocess.CREATE_NEW_PROCESS_GROUP | subprocess.CREATE_NO_WINDOW}
-
     def _end_group(process: subprocess.Popen[str]) -> None:
         if process.poll() is None:
             command = ["taskkill", "/T", "/F", "/PID", str(process.pid)]
@@ -96,10 +93,6 @@ if sys.platform == "win32":
             process.wait()
 
 else:
-
-    def _own_group() -> dict[str, Any]:
-        """Popen options: it can be ended with its children."""
-        return {"start_new_session": True}
 
     def _end_group(process: subprocess.Popen[str]) -> None:
         if process.poll() is not None:  # its number may belong to somebody else by now

@@ -5,7 +5,7 @@ import json
 import time
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from ..point_methods import PointMethod
 from ..wire import protocol
@@ -109,7 +109,7 @@ def _fit_into(
             "report.json": lambda path: path.write_text(text, encoding="utf-8"),
         }
     )
-    return Outcome(files=("mesh.ply", "report.json"), summary=_summary(report))
+    return Outcome(files=("mesh.ply", "report.json"), summary=_summary(report, error))
 
 
 class _Stages:
@@ -142,41 +142,32 @@ def _report(
     mesh: "SurfaceMesh",
     seconds: float,
     error: "ErrorAgainstTruth | None",
-) -> dict[str, object]:
-    """The numbers for report.json; the unit is the last word of a key."""
+) -> dict[str, Any]:
+    """The numbers for report.json, where a reconstruction has them; the unit is the last word of a key."""
     import trimesh
 
+    from ..stages.report import error_numbers
+
     closed = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).is_watertight
-    whole = None if error is None else error.whole
     return {
         "method": parsed.method,
         "normals_known": parsed.normals_known,
         "num_points": num_points,
-        "num_faces": len(mesh.faces),
-        "watertight": bool(closed),
-        "seconds": round(seconds, 2),
+        "mesh": {"num_faces": len(mesh.faces), "watertight": bool(closed)},
+        "total_seconds": round(seconds, 2),
         "decisions": [{"what": d.what, "choice": d.choice, "because": d.because} for d in mesh.decisions],
-        "error": whole
-        and {
-            "accuracy_percent": whole.accuracy_percent,
-            "completeness_percent": whole.completeness_percent,
-            "chamfer_percent": whole.chamfer_percent,
-            "f_score_at_half_percent": whole.f_score_at_half_percent,
-            "f_score_at_one_percent": whole.f_score_at_one_percent,
-            "normal_consistency": whole.normal_consistency,
-        },
+        "error": None if error is None else error_numbers(error),
     }
 
 
-def _summary(report: dict[str, object]) -> tuple[str, ...]:
-    closed = "closed" if report["watertight"] else "open"
-    lines = [
-        f"{report['num_faces']} triangles, {closed}; {report['num_points']} points; {report['seconds']} s"
-    ]
-    error = report["error"]
-    if isinstance(error, dict):
+def _summary(report: dict[str, Any], error: "ErrorAgainstTruth | None") -> tuple[str, ...]:
+    mesh = report["mesh"]
+    closed = "closed" if mesh["watertight"] else "open"
+    told = f"{mesh['num_faces']} triangles, {closed}; {report['num_points']} points"
+    lines = [f"{told}; {report['total_seconds']} s"]
+    if error is not None:
         lines.append(
-            f"Error against the truth: Chamfer {error['chamfer_percent']:.3f} % of the diagonal, "
-            f"F-score at 1 %: {error['f_score_at_one_percent']:.3f}"
+            f"Error against the truth: Chamfer {error.whole.chamfer_percent:.3f} % of the diagonal, "
+            f"F-score at 1 %: {error.whole.f_score_at_one_percent:.3f}"
         )
     return tuple(lines)

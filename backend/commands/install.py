@@ -186,7 +186,7 @@ def _check(folder: Path, installer: Installer) -> list[protocol.Checked]:
     said = last[0].text if last and isinstance(last[0], protocol.Failed) else "The check gave no answer."
     raise ReconstructionError(
         ErrorCode.MISSING_DEPENDENCY,
-        f"The environment can not be used. {said}",
+        f"The environment cannot be used. {said}",
         "Show Log has the details; please report it if installing again does not help.",
     )
 

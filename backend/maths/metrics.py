@@ -168,7 +168,7 @@ def load_truth(path: Path) -> TrueSurface:
         vertices = np.asarray(geometry.vertices, np.float64)
         faces = np.asarray(getattr(geometry, "faces", np.zeros((0, 3))), np.int64)
     except READ_FAILURES as error:
-        raise _unreadable(f"The true surface {path.name} can not be read ({error}).") from error
+        raise _unreadable(f"The true surface {path.name} cannot be read ({error}).") from error
     if len(vertices) < 3 or not np.isfinite(vertices).all() or not np.ptp(vertices, axis=0).any():
         raise _unreadable(f"The true surface {path.name} holds no surface.")
     if len(faces) and not (faces.min() >= 0 and faces.max() < len(vertices)):

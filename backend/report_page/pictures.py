@@ -46,7 +46,7 @@ class Picture:
     width: int
     height: int
     alt: str
-    """What it shows, for those who can not see it."""
+    """What it shows, for those who cannot see it."""
 
     @property
     def data_uri(self) -> str:

@@ -45,7 +45,7 @@ _WORTH_REFINING_PX = 0.3
 the surface 2 % worse, and stereo takes as long again."""
 _LARGEST_SHARE_LEFT = 0.5
 """Adjusted cameras are taken where they leave less than this of the evidence: a lens that is not as modelled,
-or a subject that moved, can not be mended by moving cameras."""
+or a subject that moved, cannot be mended by moving cameras."""
 _LARGEST_MOVE_PX = 4.0
 """By which adjusting may move what a camera sees: beyond, patches were not found but mistaken."""
 

@@ -62,7 +62,9 @@ def find_photos(sources: Sequence[Path]) -> list[Path]:
     if not found:
         places = ", ".join(str(source) for source in sources) or "the list"
         text = f"There are no photographs in {places}."
-        raise ReconstructionError(ErrorCode.NO_PHOTOS, text, "Give a folder with JPEG, PNG or TIFF files.")
+        raise ReconstructionError(
+            ErrorCode.NO_PHOTOS, text, "Give a folder with JPEG, PNG, TIFF, WebP or BMP files."
+        )
     if len(found) == 1:
         text = "There is only one photograph."
         raise ReconstructionError(
@@ -100,6 +102,15 @@ def match_masks(names: Sequence[str], masks_folder: Path) -> dict[str, Path]:
         remedy = f"Name the mask of {names[0]} {Path(names[0]).stem}.png."
         raise ReconstructionError(ErrorCode.MASK_UNUSABLE, text, remedy)
     return matched
+
+
+def without_masks_text(names: Sequence[str]) -> str:
+    """What to say of photographs without masks where others have some."""
+    others = f" and {len(names) - 3} more" if len(names) > 3 else ""
+    return (
+        f"There is no mask for {', '.join(names[:3])}{others}: their background may stay in the mesh. "
+        f"Name the mask of {names[0]} {Path(names[0]).stem}.png."
+    )
 
 
 def _load_photo(path: Path, name: str, mask_path: Path | None, config: PhotosConfig) -> Photo:

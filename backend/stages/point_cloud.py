@@ -32,14 +32,14 @@ class PointCloud:
 def read_cloud(path: Path) -> PointCloud:
     """The points of a PLY file, or of a text file with the columns x y z [nx ny nz].
 
-    Raises ReconstructionError(CLOUD_UNUSABLE) as `clean_cloud` does, or if the file can not be read.
+    Raises ReconstructionError(CLOUD_UNUSABLE) as `clean_cloud` does, or if the file cannot be read.
     """
     if not path.is_file():
         raise _unusable(f"The cloud {path.name} does not exist.")
     try:
         positions, normals = _read_ply(path) if path.suffix.lower() == ".ply" else _read_text(path)
     except READ_FAILURES as error:
-        raise _unusable(f"The cloud {path.name} can not be read ({error}).") from error
+        raise _unusable(f"The cloud {path.name} cannot be read ({error}).") from error
     return clean_cloud(positions, normals)
 
 

@@ -97,7 +97,7 @@ def _of_cameras(cameras: list[Camera]) -> tuple[Float64[np.ndarray, "3"], float]
     if radius <= 0:
         raise ReconstructionError(
             ErrorCode.CAMERAS_UNUSABLE,
-            "The cameras do not look at a common place, so the subject can not be located.",
+            "The cameras do not look at a common place, so the subject cannot be located.",
             "Check the cameras file, or give masks of the subject.",
         )
     return centre, radius

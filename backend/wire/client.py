@@ -81,7 +81,7 @@ class WireProcess:
                 stdout=subprocess.PIPE,
                 stderr=log,
                 env=clean_environment(os.environ) if environment is None else dict(environment),
-                **_own_group(),
+                **own_group(),
             )
         threading.Thread(target=self._read, name="wire reader", daemon=True).start()
 
@@ -223,8 +223,8 @@ def _tail(path: Path) -> str:
 if sys.platform == "win32":
     _INTERRUPT = signal.CTRL_BREAK_EVENT
 
-    def _own_group() -> dict[str, Any]:
-        """Popen options: no Ctrl-C of the caller reaches the backend, and no window opens."""
+    def own_group() -> dict[str, Any]:
+        """Popen options: no Ctrl-C of the caller reaches it, and no window opens."""
         return {"creationflags": subprocess.CREATE_NEW_PROCESS_GROUP | subprocess.CREATE_NO_WINDOW}
 
     def _kill_group(process: subprocess.Popen[bytes]) -> None:
@@ -233,8 +233,8 @@ if sys.platform == "win32":
 else:
     _INTERRUPT = signal.SIGINT
 
-    def _own_group() -> dict[str, Any]:
-        """Popen options: no Ctrl-C of the caller reaches the backend."""
+    def own_group() -> dict[str, Any]:
+        """Popen options: no Ctrl-C of the caller reaches it, and it can be ended with its children."""
         return {"start_new_session": True}
 
     def _kill_group(process: subprocess.Popen[bytes]) -> None:

@@ -49,9 +49,10 @@ def test_a_cloud_becomes_a_mesh_with_its_numbers(cloud: Path, tmp_path: Path) ->
     assert {path.name for path in output.iterdir()} == {".fewview", "mesh.ply", "report.json"}
     assert str(output / "mesh.ply") in run.stdout
     report = json.loads((output / "report.json").read_text())
-    assert report["watertight"]
-    assert report["num_faces"] == len(read_mesh(output / "mesh.ply").faces)
-    assert report["error"]["chamfer_percent"] < 0.5
+    assert report["mesh"]["watertight"]
+    assert report["mesh"]["num_faces"] == len(read_mesh(output / "mesh.ply").faces)
+    assert report["error"]["whole"]["chamfer_percent"] < 0.5
+    assert 0 < report["total_seconds"] < 100
     assert report["num_points"] == 400
     told = {decision["what"]: decision["choice"] for decision in report["decisions"]}
     assert told["points that are not finite"] == "2 of 402 left out"

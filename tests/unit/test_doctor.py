@@ -26,7 +26,7 @@ def conversation(*python: str) -> tuple[int, list[Message]]:
 
 
 def checks(*faulty: str) -> list[Check]:
-    names = ["Python", *doctor.DEPENDENCIES.values(), "cuda", "cpu"]
+    names = ["Python", *doctor.DEPENDENCIES.values(), "compiled code", "cuda", "cpu"]
     return [Check(name=name, fine=name not in faulty, found="?") for name in names]
 
 
@@ -83,6 +83,19 @@ def test_faults_are_named_by_kind(faulty: tuple[str, ...], code: ErrorCode, word
     assert error.code is code
     assert words in error.text
     assert ("pip install" in error.remedy) == ("torch" in faulty)
+
+
+@pytest.mark.parametrize(
+    ("faulty", "words"),
+    [
+        (("Python", "torch"), "take Python 3.11 or a later one"),
+        (("torch", "compiled code"), f"`{sys.executable} -m pip install --constraint constraints.txt .`"),
+        (("compiled code",), "report it"),
+        (("cuda",), "update the driver of cuda, or compute with `--device cpu`"),
+    ],
+)
+def test_the_remedy_in_a_shell_is_that_of_the_first_fault(faulty: tuple[str, ...], words: str) -> None:
+    assert words in doctor.as_text(checks(*faulty)).splitlines()[-1]
 
 
 def test_it_can_be_cancelled(tmp_path: Path) -> None:

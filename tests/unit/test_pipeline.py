@@ -129,6 +129,20 @@ def test_masks_that_are_no_longer_given_are_forgotten(photos: Path, tmp_path: Pa
     assert all(photo.mask is None for photo in up_to_the_cameras(job_of(photos)))
 
 
+def test_photographs_without_masks_among_others_with_masks_are_told(photos: Path, tmp_path: Path) -> None:
+    masks = make_photos(tmp_path / "masks", 5)
+    warned: list[str] = []
+    listener = Quiet()
+    listener.warned = warned.append  # type: ignore[method-assign]
+    up_to_the_cameras(job_of(photos, masks=masks), listener)
+    assert not warned
+    (masks / "1.png").rename(masks / "l.png")
+    up_to_the_cameras(job_of(photos, masks=masks), listener)
+    (text,) = warned
+    assert "no mask for 1.png:" in text
+    assert "Name the mask of 1.png 1.png" in text
+
+
 def test_a_finished_job_is_not_replaced_by_another_shoot(photos: Path, tmp_path: Path) -> None:
     """Photographs are told apart by what is in them: cameras begin to count at the same number each time."""
     up_to_the_cameras(job_of(photos))
