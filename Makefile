@@ -106,7 +106,8 @@ scaling: .venv/.ready .venv-blender/.ready
 
 points: .venv/.ready
 	$(if $(DATA),,$(error clouds are needed: make points DATA=FOLDER))
-	$(BACKEND) -m benchmarks.points --data $(DATA) --output $(BENCHMARK)/points
+	$(BACKEND) -m benchmarks.points --data $(DATA) --output $(BENCHMARK)/points \
+	    $(if $(RECORD),--record $(RECORD))
 
 .venv/.ready: pyproject.toml constraints.txt
 	$(PYTHON) -m venv .venv

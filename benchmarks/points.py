@@ -4,17 +4,21 @@
 
 The clouds of the shared data as they are, and 1024 points drawn from their true surfaces with noise. Poisson
 (that of pycolmap) gets normals from neighbours, made consistent along a spanning tree, where none are given.
-Leaves table.md and results.json, written anew after every fit; what is in results.json is not measured again,
-but a network after other steps is.
+Leaves table.md and results.json, written anew after every fit; called again with the same folder it goes on,
+and measures again only what depends on something that has changed.
 """
 
 import argparse
+import hashlib
 import json
 import logging
 import sys
 import tempfile
 import time
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -25,12 +29,16 @@ import trimesh
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import breadth_first_order, connected_components, minimum_spanning_tree
 
-from backend.benchmark.summary import markdown
+from backend.benchmark.measuring import Measurement, measuring_fingerprint, runs_written
+from backend.benchmark.record import write_record
+from backend.benchmark.summary import Summary, aggregate, markdown
+from backend.benchmark.writing import machine_facts
 from backend.errors import ReconstructionError
 from backend.machine import choose_device, set_up_torch
 from backend.maths.metrics import TrueSurface, load_truth, surface_error
 from backend.maths.nearest import nearest_tree
 from backend.maths.neighbours import neighbour_planes
+from backend.pipeline import versions
 from backend.point_methods import PointMethod
 from backend.scene import SurfaceMesh, no_progress
 from backend.stages import point_network
@@ -39,6 +47,7 @@ from backend.stages.point_cloud import PointCloud, clean_cloud, read_cloud
 from backend.stages.point_fit import PointFitConfig, fit_points
 from backend.stages.point_mesh import mesh_of_points
 from backend.stages.point_network import NetworkConfig
+from backend.workspace import fingerprint
 
 NAMES = ("anchor", "00011084", "00016513", "00994122")
 NOISE_PERCENT = (0.0, 0.5, 2.5)
@@ -143,30 +152,45 @@ def consistent_normals(positions: np.ndarray) -> np.ndarray:
     return normals
 
 
-def place_of(case: str, method: str, steps: int) -> dict[str, object]:
-    """Where a result stands among the others; only a network's depends on the steps."""
-    return {"case": case, "method": method, "steps": steps if method in point_network.METHODS else None}
+def inputs_of(case: Case, method: str, steps: int) -> str:
+    """Changes with the code, the cloud, the truth and, where it is a network's, the number of steps."""
+    arrays = (case.cloud.positions, case.cloud.normals, case.truth.vertices, case.truth.faces)
+    data = [
+        hashlib.sha256(np.ascontiguousarray(array).tobytes()).hexdigest()
+        for array in arrays
+        if array is not None
+    ]
+    of_network = steps if method in point_network.METHODS else None
+    return fingerprint(measuring_fingerprint(), Path(__file__), data, case.normals_known, method, of_network)
 
 
-def measured(case: Case, method: str, steps: int) -> dict[str, object]:
+def measured(case: Case, method: str, steps: int) -> Measurement:
     """A method's seconds and error on a case, or why there are none."""
-    place = place_of(case.name, method, steps)
+    done = partial(
+        Measurement,
+        case=case.name,
+        preset=method,
+        seed=0,
+        versions=versions(),
+        device="cpu",
+        inputs=inputs_of(case, method, steps),
+    )
     began_s = time.perf_counter()
     try:
         mesh = poisson(case) if method == "poisson" else _fitted(case, method, steps)
     except ReconstructionError as error:
-        return {**place, "failure": str(error)}
+        return done(numbers={}, failure=error.text)
     seconds = time.perf_counter() - began_s
     whole = surface_error(mesh, case.truth, cameras=None, seed=0, num_samples=_SAMPLES).whole
     closed = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).is_watertight
-    return {
-        **place,
+    numbers = {
         "seconds": round(seconds, 1),
         "chamfer_percent": whole.chamfer_percent,
         "f_score_at_one_percent": whole.f_score_at_one_percent,
         "normal_consistency": whole.normal_consistency,
-        "closed": bool(closed),
+        "closed": float(closed),
     }
+    return done(numbers=numbers)
 
 
 def _fitted(case: Case, method: str, steps: int) -> SurfaceMesh:
@@ -183,29 +207,24 @@ def _fitted(case: Case, method: str, steps: int) -> SurfaceMesh:
     return mesh_of_points(surface, case.cloud, MeshConfig(), progress=no_progress)
 
 
-def table(results: list[dict[str, object]], steps: int) -> str:
-    """Markdown: Chamfer % / F@1% and seconds, a row for each case, a column for each method.
-
-    Of the networks what they were after so many steps.
-    """
-    results = [row for row in results if row["steps"] in (None, steps)]
-    methods = [method for method in METHODS if any(row["method"] == method for row in results)]
-    by_place = {(row["case"], row["method"]): row for row in results}
+def table(summaries: Sequence[Summary]) -> str:
+    """Markdown: Chamfer %, F@1% and seconds, a row for each case, a column for each method."""
+    methods = [method for method in METHODS if any(s.preset == method for s in summaries)]
+    by_place = {(summary.case, summary.preset): summary for summary in summaries}
     rows = []
-    for case in dict.fromkeys(row["case"] for row in results):
-        cells = [_cell(by_place.get((case, method))) for method in methods]
-        rows.append([str(case), *cells])
+    for case in dict.fromkeys(summary.case for summary in summaries):
+        rows.append([case, *(_cell(by_place.get((case, method))) for method in methods)])
     return markdown(["cloud", *methods], rows)
 
 
-def _cell(row: dict[str, object] | None) -> str:
-    if row is None:
+def _cell(summary: Summary | None) -> str:
+    if summary is None:
         return "-"
-    if "failure" in row:
+    if summary.failures:
         return "no surface"
-    return f"{row['chamfer_percent']:.3f} / {row['f_score_at_one_percent']:.3f}, {row['seconds']:.0f} s" + (
-        "" if row["closed"] else ", open"
-    )
+    found = summary.median
+    told = f"{found['chamfer_percent']:.3f}, {found['f_score_at_one_percent']:.3f}; {found['seconds']:.0f} s"
+    return told + ("" if found["closed"] else ", open")
 
 
 def main() -> int:
@@ -218,21 +237,28 @@ def main() -> int:
     add("--methods", nargs="+", choices=METHODS, default=list(METHODS))
     steps = NetworkConfig.steps
     add("--steps", type=int, metavar="N", default=steps, help=f"of the networks ({steps}, as fit-points)")
+    add("--record", metavar="DIR", type=Path, help="where to leave points.json and points.md")
     parsed = words.parse_args()
     logging.basicConfig(level=logging.INFO, format="%(message)s", stream=sys.stderr)
     set_up_torch(choose_device("cpu"))
     parsed.output.mkdir(parents=True, exist_ok=True)
-    path = parsed.output / "results.json"
-    results = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else []
-    known = [{key: row[key] for key in ("case", "method", "steps")} for row in results]
+    before = {run.inputs: run for run in runs_written(parsed.output) if run.failure is None}
+    runs: list[Measurement] = []
     for case in cases(parsed.data, parsed.clouds):
         for method in parsed.methods:
-            if place_of(case.name, method, parsed.steps) not in known:
-                results.append(measured(case, method, parsed.steps))
-                logger.info("%s", results[-1])
-                path.write_text(json.dumps(results, indent=2) + "\n", encoding="utf-8")
-                (parsed.output / "table.md").write_text(table(results, parsed.steps), encoding="utf-8")
-    sys.stdout.write(table(results, parsed.steps))
+            inputs = inputs_of(case, method, parsed.steps)
+            runs.append(before.pop(inputs, None) or measured(case, method, parsed.steps))
+            logger.info("%s, %s: %s", case.name, method, runs[-1].failure or runs[-1].numbers)
+            written = {"runs": [asdict(run) for run in (*runs, *before.values())]}
+            (parsed.output / "results.json").write_text(
+                json.dumps(written, indent=2) + "\n", encoding="utf-8"
+            )
+            (parsed.output / "table.md").write_text(table(aggregate(runs)), encoding="utf-8")
+    if parsed.record is not None:
+        about = {"suite": "points", "steps": parsed.steps, "samples": _SAMPLES, "machine": machine_facts()}
+        today = datetime.now(UTC).date().isoformat()
+        write_record(parsed.record, about, runs, code=measuring_fingerprint(), date=today, shown=table)
+    sys.stdout.write(table(aggregate(runs)))
     return 0
 
 
