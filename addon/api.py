@@ -85,11 +85,13 @@ def reconstruct(
 
 def _check(asked: Job) -> None:
     """What can be known before a folder is made. Raises ValueError."""
+    if not asked.images:
+        raise ValueError("There are no images: give files or folders")
     decode_job(encode_job(asked))
     named = (*asked.images, *filter(None, (asked.cameras, asked.masks, asked.truth)))
     missing = [path for path in named if not Path(path).exists()]
-    if not asked.images or missing:
-        raise ValueError(f"There is nothing at {', '.join(missing) or 'no path'}: check the path")
+    if missing:
+        raise ValueError(f"There is nothing at {', '.join(missing)}: check the path")
 
 
 def _absolute(path: Path | str | None) -> str | None:

@@ -4,6 +4,8 @@ A mesh has one colour attribute per way of showing it. Solid mode and the materi
 one: the material's node has no layer name, which means the attribute that is marked for rendering.
 """
 
+from typing import Literal
+
 import bpy
 import numpy as np
 
@@ -11,9 +13,10 @@ from .heat_map import ERROR, SUPPORT, HeatMap, heat_colours
 
 COLOUR = "Color"
 """Name of the colour attribute that a result comes with."""
-KINDS = ("COLOUR", "SUPPORT", "ERROR")
-_HEAT_MAPS = {"SUPPORT": SUPPORT, "ERROR": ERROR}
-_MISSING = {
+Kind = Literal["COLOUR", "SUPPORT", "ERROR"]
+"""What a mesh can show."""
+_HEAT_MAPS: dict[Kind, HeatMap] = {"SUPPORT": SUPPORT, "ERROR": ERROR}
+_MISSING: dict[Kind, str] = {
     "COLOUR": "This mesh has no colors: import the result again",
     "SUPPORT": "This mesh does not know its support: import the result again",
     "ERROR": "The error is not known yet: press Measure Error first",
@@ -41,27 +44,27 @@ def make_material(name: str, mean_linear: tuple[float, float, float]) -> bpy.typ
     return material
 
 
-def can_show(mesh: bpy.types.Mesh, kind: str) -> bool:
-    """Whether the mesh has what `kind`, one of KINDS, shows."""
+def can_show(mesh: bpy.types.Mesh, kind: Kind) -> bool:
+    """Whether the mesh has what `kind` shows."""
     if kind == "COLOUR":
         return _colours_or_none(mesh, COLOUR) is not None
     return _values_or_none(mesh, _HEAT_MAPS[kind]) is not None
 
 
-def shown(mesh: bpy.types.Mesh) -> str:
-    """Which of KINDS the mesh shows; empty for an attribute of the user's own."""
+def shown(mesh: bpy.types.Mesh) -> Kind | None:
+    """What the mesh shows; None for an attribute of the user's own."""
     active = mesh.color_attributes.active_color
-    names = {COLOUR: "COLOUR", **{heat.colours: kind for kind, heat in _HEAT_MAPS.items()}}
-    return "" if active is None else names.get(active.name, "")
+    names: dict[str, Kind] = {COLOUR: "COLOUR", **{heat.colours: kind for kind, heat in _HEAT_MAPS.items()}}
+    return None if active is None else names.get(active.name)
 
 
 def legend(mesh: bpy.types.Mesh) -> str:
     """What the colours mean that the mesh shows, in a line; empty for its own colours."""
-    heat = _HEAT_MAPS.get(shown(mesh))
-    return "" if heat is None else heat.legend
+    kind = shown(mesh)
+    return "" if kind is None or kind == "COLOUR" else _HEAT_MAPS[kind].legend
 
 
-def show(mesh: bpy.types.Mesh, kind: str) -> None:
+def show(mesh: bpy.types.Mesh, kind: Kind) -> None:
     """Show the mesh's own colours, its support or its error, in the viewport and in renders.
 
     Raises ValueError, in a sentence for the user, where the mesh has no such values or is being edited.

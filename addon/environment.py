@@ -14,6 +14,8 @@ from ..backend.wire.protocol import Checked
 VARIABLE = "FEWVIEW_PYTHON"
 """Environment variable with the Python to use, before every other choice."""
 MANAGED_NAME = "environment"
+HAND_VERSION = "3.12"
+"""The Python that the lines for a shell ask for."""
 _PYTHON, _DEVICES = "Python", {"cuda": "CUDA", "mps": "MPS", "cpu": "CPU"}
 
 
@@ -109,9 +111,9 @@ def hand_lines(folder: Path, *, root: Path = ROOT, windows: bool = sys.platform 
     Raises OSError where the extension is incomplete.
     """
     if windows:
-        python, made = ["py", "-3.12"], f"{folder}\\Scripts\\python.exe"
+        python, made = ["py", f"-{HAND_VERSION}"], f"{folder}\\Scripts\\python.exe"
     else:
-        python, made = ["python3.12"], f"{folder}/bin/python"
+        python, made = [f"python{HAND_VERSION}"], f"{folder}/bin/python"
     install = [made, "-m", "pip", "install", "--constraint", str(root / CONSTRAINTS), *requirements(root)]
     quoted = _quoted_for_cmd if windows else shlex.join
     return f"{quoted([*python, '-m', 'venv', str(folder)])}\n{quoted(install)}"

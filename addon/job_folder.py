@@ -59,7 +59,8 @@ class PastJob:
     def words(self) -> str:
         """What it is, for a list."""
         if self.job is not None:
-            return f"{self.folder.name}: {self.job.preset}, {len(self.job.images)} images"
+            count = len(self.job.images)  # one may be a folder with any number of photographs
+            return f"{self.folder.name}: {self.job.preset}" + (f", {count} images" if count > 1 else "")
         return f"{self.folder.name}: {'points' if self.of_points else 'from the command line'}"
 
 
@@ -150,6 +151,11 @@ def read_job(folder: Path) -> PastJob:
 def can_be_rendered(folder: Path) -> bool:
     """Whether the folder of a job holds what the backend renders from cameras."""
     return any((results_in(folder) / name).is_file() for name in (MESH, RADIANCE))
+
+
+def has_report(folder: Path) -> bool:
+    """Whether the folder of a job holds a page for a web browser; a fit to points leaves none."""
+    return (results_in(folder) / REPORT_PAGE).is_file()
 
 
 def past_jobs(parent: Path) -> tuple[PastJob, ...]:

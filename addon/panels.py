@@ -12,7 +12,7 @@ from .drawing import draw_button, draw_state, draw_text
 from .environment import State
 from .error_map import numbers_of
 from .job_boxes import draw_ended, draw_environment, draw_running
-from .job_folder import can_be_rendered, past_jobs
+from .job_folder import can_be_rendered, has_report, past_jobs
 from .operators.environment import backend_state
 from .operators.images import list_problems
 from .operators.reconstruct import jobs_parent
@@ -152,6 +152,7 @@ class FEWVIEW_PT_cameras(_Step, bpy.types.Panel):
         row.operator("fewview.remove_cameras", icon="X", text="")
         if solved.reprojection_error_px is not None:
             layout.label(text=f"Accurate to {solved.reprojection_error_px:.1f} pixels")
+        layout.operator("fewview.show_photograph", icon="VIEW_CAMERA")
         _draw_camera_report(layout, context)
         for name, why in solved.unplaced:
             box = layout.box()
@@ -268,7 +269,8 @@ class FEWVIEW_PT_result(_Step, bpy.types.Panel):
         column.operator("fewview.export", icon="EXPORT")
         if folder and can_be_rendered(Path(folder)):
             column.operator("fewview.render_novel_views", icon="RENDER_STILL")
-        column.operator("fewview.open_report", icon="URL")
+        if folder and has_report(Path(folder)):
+            column.operator("fewview.open_report", icon="URL")
         _draw_camera_report(column, context)
         column.operator("fewview.open_folder", icon="FILE_FOLDER")
 
@@ -281,13 +283,14 @@ class FEWVIEW_PT_past_jobs(_Panel, bpy.types.Panel):
     bl_options = {"DEFAULT_CLOSED"}
 
     def draw(self, context: bpy.types.Context) -> None:
-        """Each with a button that brings it into the scene."""
+        """Each with a button that brings it into the scene, and one for a result from anywhere."""
         found = past_jobs(jobs_parent(context))[:_MOST_PAST_JOBS]
         for job in found:
             shown = self.layout.operator("fewview.import_result", text=job.words, icon="IMPORT")
             shown.folder = str(job.folder)
         if not found:
             self.layout.label(text="None in the output folder")
+        self.layout.operator("fewview.import_result", text="Import Result...", icon="FILE_FOLDER")
 
 
 class FEWVIEW_PT_points(_Panel, bpy.types.Panel):
@@ -330,7 +333,10 @@ def _draw_render(layout: bpy.types.UILayout, context: bpy.types.Context) -> None
             column.prop(settings, "elevation")
         made = bool(generated(context.scene))
         text = "Generate Again" if made else "Generate Cameras"
-        draw_button(layout, "fewview.generate_views", icon="OUTLINER_OB_CAMERA", text=text, main=not made)
+        row = layout.row(align=True)
+        draw_button(row, "fewview.generate_views", icon="OUTLINER_OB_CAMERA", text=text, main=not made)
+        if made:
+            row.operator("fewview.remove_views", icon="X", text="")
     elif settings.view_cameras == "ANIMATED":
         column.prop(settings, "frame_step")
     ready = settings.view_cameras != "GENERATED" or made

@@ -17,19 +17,19 @@ class FEWVIEW_AP_preferences(bpy.types.AddonPreferences):
 
     backend_python: StringProperty(
         name="Python",
-        description="Python that has torch and pycolmap; the managed environment where this is empty",
+        description="Python to compute with; the one that Set Up FewView made where this is empty",
         subtype="FILE_PATH",
     )
     environment_folder: StringProperty(
         name="Environment Folder",
-        description="Where the managed environment is made; the extension's user folder where this is empty",
+        description="Where Set Up FewView puts its Python; the extension's own folder where this is empty",
         subtype="DIR_PATH",
     )
     torch_build: EnumProperty(
         name="Compute On",
         items=[
             ("cpu", "CPU", "The smallest download, for every computer"),
-            ("default", "Usual", "What the package index offers for this system; on a Mac it has MPS"),
+            ("default", "Standard", "The usual build; on Linux with CUDA, on a Mac with MPS"),
             ("cuda", "CUDA", "For a GPU by NVIDIA; the largest download"),
         ],
     )
@@ -42,7 +42,9 @@ class FEWVIEW_AP_preferences(bpy.types.AddonPreferences):
 
     def draw(self, context: bpy.types.Context) -> None:
         """The page in Edit > Preferences > Add-ons."""
+        from .environment import State
         from .job_boxes import draw_environment
+        from .operators.environment import backend_state
 
         layout = self.layout
         layout.use_property_split = True
@@ -50,6 +52,10 @@ class FEWVIEW_AP_preferences(bpy.types.AddonPreferences):
         layout.prop(self, "backend_python")
         layout.prop(self, "environment_folder")
         layout.prop(self, "torch_build")
+        row = layout.row(align=True)
+        if backend_state(context)[0] is not State.NOT_READY:  # else the button above is the one to press
+            row.operator("fewview.install_backend", icon="IMPORT", text="Set Up FewView")
+        row.operator("fewview.remove_backend", icon="TRASH")
         layout.prop(self, "output")
 
 

@@ -31,7 +31,7 @@ def _lines_of(path: Path, _mtime_ns: int) -> tuple[str, ...]:
     lines = []
     num_faces = _number(report, "mesh", "num_faces")
     if num_faces is not None:
-        lines.append(f"{num_faces:,.0f} triangles")
+        lines.append(f"{num_faces:,.0f} triangles{_closed_words(report)}")
     measured, guessed = _number(report, "mesh", "measured_share"), _number(report, "mesh", "guessed_share")
     if measured is not None and guessed is not None:
         lines.append(f"{measured:.0%} measured, {guessed:.0%} guessed")
@@ -43,6 +43,13 @@ def _lines_of(path: Path, _mtime_ns: int) -> tuple[str, ...]:
     if seconds is not None:
         lines.append(f"Computed in {seconds:.0f} s")
     return tuple(lines)
+
+
+def _closed_words(report: Any) -> str:
+    """What to add to the triangles: whether the mesh is closed, or nothing where the report does not say."""
+    mesh = report.get("mesh") if isinstance(report, dict) else None
+    closed = mesh.get("watertight") if isinstance(mesh, dict) else None
+    return {True: ", closed", False: ", open"}[closed] if isinstance(closed, bool) else ""
 
 
 def _number(found: Any, *keys: str) -> float | None:

@@ -29,8 +29,13 @@ def images_state(settings: FEWVIEW_PG_settings) -> StepState:
     num_used = sum(image.use for image in settings.images)
     if not settings.images:
         return StepState(icon=TODO, text="No photographs yet")
-    if num_used < 2 or any(image.use and "missing" in image.problem for image in settings.images):
-        return StepState(icon=TROUBLE, text=f"{num_used} photographs in use")
+    num_missing = sum(image.use and "missing" in image.problem for image in settings.images)
+    if num_missing:
+        files = "file" if num_used == 1 else "files"
+        return StepState(icon=TROUBLE, text=f"{num_missing} of {num_used} {files} missing")
+    if num_used < FEWEST_IMAGES:
+        photographs = "photograph" if num_used == 1 else "photographs"
+        return StepState(icon=TROUBLE, text=f"{num_used} {photographs} in use")
     icon = TROUBLE if list_problems(settings) else READY
     return StepState(icon=icon, text=f"{num_used} photographs")
 

@@ -151,7 +151,7 @@ class FEWVIEW_OT_remove_cameras(bpy.types.Operator):
 
 
 class FEWVIEW_OT_show_photograph(bpy.types.Operator):
-    """Look through the camera of a photograph; the scene's resolution becomes the photograph's"""
+    """Look through the camera of the list's active photograph; the scene takes over its resolution"""
 
     bl_idname = "fewview.show_photograph"
     bl_label = "Show Photograph"

@@ -18,7 +18,7 @@ _BUSY = "Wait until the running job ends, or cancel it"
 _BUILDS = [
     ("PREFERENCES", "As in the Preferences", "The build that is chosen there"),
     ("cpu", "CPU", "The smallest download, for every computer"),
-    ("default", "Usual", "What the package index offers for this system; on a Mac it has MPS"),
+    ("default", "Standard", "The usual build; on Linux with CUDA, on a Mac with MPS"),
     ("cuda", "CUDA", "For a GPU by NVIDIA; the largest download"),
 ]
 
@@ -211,7 +211,8 @@ class FEWVIEW_OT_remove_backend(bpy.types.Operator):
     def execute(self, context: bpy.types.Context) -> set[str]:
         """Start the removal, which takes a while: there are many files."""
         folder = managed_folder(context)
-        return _run(self, "Remove Backend", environment.remove_command(sys.executable, folder), folder=folder)
+        command = environment.remove_command(sys.executable, folder)
+        return _run(self, "Removing the setup", command, folder=folder)
 
 
 class FEWVIEW_OT_copy_install_lines(bpy.types.Operator):
@@ -222,13 +223,18 @@ class FEWVIEW_OT_copy_install_lines(bpy.types.Operator):
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         """Put them on the clipboard."""
+        folder = Path.home() / "fewview-environment"
         try:
-            lines = environment.hand_lines(Path.home() / "fewview-environment")
+            lines = environment.hand_lines(folder)
         except OSError as error:
             self.report({"ERROR"}, f"The extension is incomplete, install it again ({error})")
             return {"CANCELLED"}
         context.window_manager.clipboard = lines
-        self.report({"INFO"}, "Copied. Run them in a shell, then choose that Python in the preferences")
+        self.report(
+            {"INFO"},
+            f"Copied. Run them in a shell, where Python {environment.HAND_VERSION} must be installed; "
+            f"then choose {python_in(folder)} as Python in the preferences",
+        )
         return {"FINISHED"}
 
 

@@ -105,7 +105,7 @@ class FEWVIEW_OT_add_images(bpy.types.Operator):
         settings.source = "FILES"
         if len(settings.images) >= MOST_IMAGES:
             self.report({"WARNING"}, f"The list is full: it takes {MOST_IMAGES} photographs")
-        self.report({"INFO"}, f"{num_new} photographs added")
+        self.report({"INFO"}, f"{num_new} {'photograph' if num_new == 1 else 'photographs'} added")
         return {"FINISHED"}
 
     def _paths(self) -> tuple[list[Path], tuple[str, ...]]:

@@ -8,8 +8,7 @@ from bpy.props import FloatProperty, FloatVectorProperty
 
 from .. import region
 from ..mesh_import import select_alone
-
-Status = set[str]
+from .on_result import Status
 
 
 class FEWVIEW_OT_add_region(bpy.types.Operator):

@@ -36,8 +36,9 @@ class FEWVIEW_OT_import_result(bpy.types.Operator):
         name="Job",
         description="Folder of the job; the newest one where this is empty",
         subtype="DIR_PATH",
-        options={"SKIP_SAVE"},
+        options={"SKIP_SAVE", "HIDDEN"},
     )
+    directory: StringProperty(subtype="DIR_PATH", options={"SKIP_SAVE", "HIDDEN"})
     cameras: BoolProperty(name="Cameras", description="Import the cameras and the points, too", default=True)
 
     @classmethod
@@ -46,6 +47,14 @@ class FEWVIEW_OT_import_result(bpy.types.Operator):
             cls.poll_message_set("Change to Object Mode first")
             return False
         return True
+
+    def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> Status:
+        if self.folder:
+            return self.execute(context)
+        # Without a property for files the browser chooses folders.
+        self.directory = str(jobs_parent(context))
+        context.window_manager.fileselect_add(self)
+        return {"RUNNING_MODAL"}
 
     def execute(self, context: bpy.types.Context) -> Status:
         try:
@@ -59,8 +68,9 @@ class FEWVIEW_OT_import_result(bpy.types.Operator):
         return {"FINISHED"}
 
     def _folder(self, context: bpy.types.Context) -> Path:
-        if self.folder:
-            return Path(bpy.path.abspath(self.folder)).absolute()
+        chosen = self.folder or self.directory
+        if chosen:
+            return Path(bpy.path.abspath(chosen)).absolute()
         parent = jobs_parent(context)
         found = past_jobs(parent)
         if not found:
@@ -71,7 +81,7 @@ class FEWVIEW_OT_import_result(bpy.types.Operator):
 
 
 class _Show(OnResult):
-    kind: ClassVar[str]
+    kind: ClassVar[colours.Kind]
     unavailable: ClassVar[str]
     poll_message_set: ClassVar[Callable[[str], None]]
 

@@ -9,6 +9,7 @@ from .. import result_mesh
 from ..camera_objects import JOB
 from ..job_folder import (
     CAMERAS_PAGE,
+    REPORT_NUMBERS,
     REPORT_PAGE,
     FolderError,
     inside,
@@ -108,7 +109,10 @@ class FEWVIEW_OT_open_report(_OnFolder, bpy.types.Operator):
             folder = self._job_folder(context)
             page = inside(folder, results_in(folder) / REPORT_PAGE)
             if not page.is_file():
-                raise FolderError(f"The job {folder.name} has no report")
+                raise FolderError(
+                    f"The job {folder.name} has no {REPORT_PAGE}: surfaces fitted to points come with "
+                    f"{REPORT_NUMBERS} alone; press Open Folder"
+                )
             bpy.ops.wm.url_open(url=page.as_uri())
         except (FolderError, RuntimeError) as error:
             return refused(self, error)

@@ -6,11 +6,14 @@ import shlex
 import shutil
 import subprocess
 import sys
+import tomllib
 import zipfile
+from functools import partial
 from pathlib import Path
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 from typing import Any
 
+import fake_layout
 import pytest
 
 from tests.stand_in_packages import write_wheels
@@ -212,7 +215,7 @@ def test_a_python_without_packages_is_not_ready(preferences: Any, operators: Any
     python = bare_environment(tmp_path / "bare")
     preferences.backend_python = str(python)
     assert operators.backend_python_or_reason(bpy.context) == (python, ""), "not checked yet, so taken"
-    with pytest.raises(RuntimeError, match="can not reconstruct: numpy"):
+    with pytest.raises(RuntimeError, match="cannot reconstruct: numpy"):
         bpy.ops.fewview.check_backend()
     found, reason = operators.backend_python_or_reason(bpy.context)
     assert found is None
@@ -294,8 +297,69 @@ def test_an_installation_that_fails_leaves_nothing_that_could_be_taken_for_one(
     assert operators.backend_python_or_reason(bpy.context)[0] is None
 
 
-def test_the_lines_are_copied(preferences: Any) -> None:
+def test_the_lines_are_copied(
+    preferences: Any, environment: Any, tmp_path: Path, monkeypatch: Any, capfd: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(Path, "home", lambda: tmp_path)
     assert bpy.ops.fewview.copy_install_lines() == {"FINISHED"}
+    said = capfd.readouterr().out
+    folder = tmp_path / "fewview-environment"
+    lines = environment.hand_lines(folder)
+    assert "Python 3.12" in said
+    assert "3.12" in lines.split()[0 if sys.platform != "win32" else 1]
+    assert str(environment.python_in(folder)) in said
+    assert lines.splitlines()[1].startswith(shlex.quote(str(environment.python_in(folder))))
+
+
+@pytest.mark.parametrize("made", [False, True])
+def test_setting_up_again_offers_to_make_anew(
+    preferences: Any, operators: Any, environment: Any, monkeypatch: Any, made: bool
+) -> None:
+    """It is ready: without that tick it would stay as it is."""
+    folder = operators.managed_folder(bpy.context)
+    if made:
+        touch(environment.python_in(folder))
+        touch(folder / ".fewview-environment")
+        check = importlib.import_module(
+            environment.__name__.replace("addon.environment", "backend.wire.protocol")
+        ).Checked(name="torch", fine=True, found="2.13.0")
+        environment.remember(environment.python_in(folder), [check], finished=True)
+        assert operators.backend_state(bpy.context)[0] is environment.State.READY
+    cls = operators.FEWVIEW_OT_install_backend
+    layout = fake_layout.FakeLayout()
+    drawn = SimpleNamespace(layout=layout, build="cpu", folder="", bl_rna=rna_of(cls))
+    drawn._build, drawn._folder = partial(cls._build, drawn), partial(cls._folder, drawn)
+    cls.draw(drawn, bpy.context)
+    assert layout.props() == ({"build", "again"} if made else {"build"})
+    assert bpy.ops.fewview.remove_backend.poll() == made
+
+
+def rna_of(cls: Any) -> Any:
+    return fake_layout.operator_type(cls.bl_idname)
+
+
+def test_removing_has_a_title_that_can_be_done(
+    preferences: Any, operators: Any, environment: Any, monkeypatch: Any
+) -> None:
+    """The sidebar says "... is done"."""
+    touch(operators.managed_folder(bpy.context) / ".fewview-environment")
+    titles: list[str] = []
+    monkeypatch.setattr(operators.jobs, "start", lambda title, *_, **__: titles.append(title))
+    monkeypatch.setattr(operators.jobs, "follow", lambda _: {"FINISHED"})
+    assert bpy.ops.fewview.remove_backend() == {"FINISHED"}
+    assert titles == ["Removing the setup"]
+
+
+def test_the_words_of_the_preferences_have_no_jargon(preferences: Any, operators: Any) -> None:
+    properties = preferences.bl_rna.properties
+    page = [properties[name].description for name in ("backend_python", "environment_folder")]
+    assert not [text for text in page if "managed" in text or "pycolmap" in text]
+    assert all("Set Up FewView" in text for text in page)
+    asked = fake_layout.operator_type("fewview.install_backend").properties["build"].enum_items
+    chosen = properties["torch_build"].enum_items
+    assert chosen.keys() == ["cpu", "default", "cuda"]  # saved in users' preferences
+    for items in (asked, chosen):
+        assert (items["default"].name, "index" in items["default"].description) == ("Standard", False)
 
 
 def test_tooltips_are_as_blender_has_them(operators: Any) -> None:
@@ -325,6 +389,18 @@ def test_the_zip_holds_what_is_needed_and_nothing_else(extension_zip: Path) -> N
     }
     assert {"backend/wire/client.py", "addon/operators/environment.py"} <= set(names)
     assert not [name for name in names if "__pycache__" in name or name.endswith((".pyc", ".blend"))]
+
+
+def test_permissions_say_what_for_in_a_line_that_blender_takes() -> None:
+    """Blender's `extension validate` asks for at most 64 characters without punctuation at their end."""
+    with (ROOT / "blender_manifest.toml").open("rb") as file:
+        permissions = tomllib.load(file)["permissions"]
+    assert set(permissions) == {"files", "network", "clipboard"}
+    for why in permissions.values():
+        assert 0 < len(why) <= 64
+        assert why[-1].isalnum()
+    assert "backend" not in " ".join(permissions.values())
+    assert "report" in permissions["clipboard"]  # Copy Report
 
 
 def test_blender_has_no_complaints_about_the_extension(addon: ModuleType) -> None:

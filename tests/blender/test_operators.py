@@ -331,9 +331,10 @@ def test_a_folder_gives_its_images_by_name(settings: Any, tmp_path: Path, argume
     assert names_in(settings) == sorted(names)
 
 
-def test_one_file(settings: Any, tmp_path: Path) -> None:
+def test_one_file(settings: Any, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     add_pictures(tmp_path, "a.PNG", "b.png", "c.png")
     assert bpy.ops.fewview.add_images(filepath=str(tmp_path / "b.png")) == {"FINISHED"}
+    assert "1 photograph added" in capfd.readouterr().out
     assert names_in(settings) == ["b.png"]
     # The file browser says both.
     assert bpy.ops.fewview.add_images(directory=str(tmp_path), filepath=str(tmp_path / "a.PNG"))

@@ -286,6 +286,10 @@ def test_the_preferences_say_how_it_stands(sidebar: Sidebar, state: str, words: 
     assert words in layout.texts()
     assert layout.main() == main
     assert layout.props() == {"backend_python", "environment_folder", "torch_build", "output"}
+    buttons = [drawn.what for drawn in layout.drawn if drawn.kind == "operator"]
+    assert buttons.count("fewview.install_backend") == 1  # again where it is ready, but not twice
+    build = [drawn.what for drawn in layout.drawn].index("torch_build")
+    assert "fewview.remove_backend" in [drawn.what for drawn in layout.drawn[build:-1]]
 
 
 # Step 1.
@@ -338,12 +342,18 @@ def test_a_missing_file_is_shown(sidebar: Sidebar) -> None:
     sidebar.settings.images[1].problem = "The file is missing"
     sidebar.settings.active_image = 1
     layout = sidebar.draw_all()["FEWVIEW_PT_images"]
-    assert sidebar.line("images")[0] == "ERROR"
+    assert sidebar.line("images") == ("ERROR", "1 of 3 files missing")
     assert any(drawn.icon == "ERROR" and "missing" in drawn.text for drawn in layout.drawn)
     sidebar.settings.images[1].use = False
     sidebar.settings.active_image = 0
     sidebar.draw_all()
     assert sidebar.line("images") == ("ERROR", "2 photographs")  # few, but not missing
+    sidebar.settings.images[0].use = False
+    assert sidebar.line("images") == ("ERROR", "1 photograph in use")
+    sidebar.settings.images[2].problem = "The file is missing"
+    assert sidebar.line("images") == ("ERROR", "1 of 1 file missing")
+    sidebar.settings.images[2].use = False
+    assert sidebar.line("images") == ("ERROR", "0 photographs in use")
 
 
 def test_an_active_photograph_that_is_not_there(sidebar: Sidebar) -> None:
@@ -357,12 +367,13 @@ def test_the_generated_cameras_come_before_the_rendering(sidebar: Sidebar) -> No
     sidebar.settings.source = "RENDER"
     layout = sidebar.draw_all()["FEWVIEW_PT_images"]
     assert layout.main() == ["fewview.generate_views"]
-    assert "fewview.render_views" not in layout.operators()
+    assert not {"fewview.render_views", "fewview.remove_views"} & set(layout.operators())
     target = sidebar.target()
     assert bpy.ops.fewview.generate_views(target=target.name) == {"FINISHED"}
     layout = sidebar.draw_all()["FEWVIEW_PT_images"]
     assert layout.main() == ["fewview.render_views"]
     assert layout.operators()["fewview.generate_views"].text == "Generate Again"
+    assert layout.operators()["fewview.remove_views"].icon == "X"
     sidebar.photographs(*[(800, 600)] * 3)
     assert sidebar.draw_all()["FEWVIEW_PT_images"].main() == []
 
@@ -400,6 +411,7 @@ def test_cameras_are_estimated_unless_they_are_known(sidebar: Sidebar) -> None:
     layout = sidebar.draw_all()["FEWVIEW_PT_cameras"]
     assert sidebar.line("cameras") == (sidebar.automatic, "Estimated when you reconstruct")
     assert layout.operators()["fewview.estimate_cameras"].text == "Estimate Cameras"
+    assert "fewview.show_photograph" not in layout.operators()
     sidebar.settings.camera_source = "KNOWN"
     assert sidebar.line("cameras") == ("RADIOBUT_OFF", "No file chosen")
     sidebar.settings.cameras_path = str(sidebar.folder / "transforms.json")
@@ -416,7 +428,7 @@ def test_found_cameras_and_who_has_none(sidebar: Sidebar) -> None:
     layout = sidebar.draw_all()["FEWVIEW_PT_cameras"]
     assert sidebar.line("cameras") == ("CHECKMARK", "2 of 2 photographs placed")
     assert "Accurate to 0.4 pixels" in layout.texts()
-    assert "fewview.remove_cameras" in layout.operators()
+    assert {"fewview.remove_cameras", "fewview.show_photograph"} <= set(layout.operators())
     path = sidebar.solved(unplaced=(("dark.jpg", "too few features"),))
     os.utime(path, ns=(1, 1))  # within the same tick of the file system's clock, maybe
     layout = sidebar.draw_all()["FEWVIEW_PT_cameras"]
@@ -556,7 +568,7 @@ def test_a_result_and_what_can_be_done_with_it(sidebar: Sidebar) -> None:
     layout = found["FEWVIEW_PT_result"]
     assert layout.main() == []
     names = ["show_colour", "show_support", "show_error", "decimate", "remesh", "export"]
-    names += ["open_report", "open_folder"]
+    names += ["open_folder"]
     assert set(layout.operators()) == {f"fewview.{name}" for name in names}
     assert bpy.ops.fewview.show_support() == {"FINISHED"}
     texts = " ".join(sidebar.draw_all()["FEWVIEW_PT_result"].texts())
@@ -573,6 +585,17 @@ def test_a_result_with_its_files_can_be_rendered(sidebar: Sidebar, name: str) ->
     assert "fewview.render_novel_views" in sidebar.draw_all()["FEWVIEW_PT_result"].operators()
     path.unlink()
     assert "fewview.render_novel_views" not in sidebar.draw_all()["FEWVIEW_PT_result"].operators()
+
+
+def test_the_report_has_a_button_while_it_is_there(sidebar: Sidebar) -> None:
+    """A surface fitted to points has none."""
+    sidebar.result()
+    page = sidebar.folder / "job" / "result" / "report.html"
+    page.parent.mkdir(parents=True)
+    for there in (True, False):
+        page.touch() if there else page.unlink()
+        layout = sidebar.draw_all()["FEWVIEW_PT_result"]
+        assert ("fewview.open_report" in layout.operators()) == there
 
 
 def test_the_report_of_the_cameras_has_a_button_while_it_is_there(sidebar: Sidebar) -> None:
@@ -613,6 +636,42 @@ def test_the_numbers_of_the_report(sidebar: Sidebar) -> None:
     path.write_text('{"mesh": {"num_faces": 12345}, "total_seconds": 61.2}')
     texts = sidebar.draw_all()["FEWVIEW_PT_result"].texts()
     assert {"12,345 triangles", "Computed in 61 s"} <= set(texts)
+
+
+def test_the_numbers_of_a_surface_fitted_to_points(sidebar: Sidebar) -> None:
+    """Its report has fewer keys, and no visible part: there are no cameras."""
+    sidebar.result()
+    path = sidebar.folder / "job" / "result" / "report.json"
+    path.parent.mkdir(parents=True)
+    report: dict[str, Any] = {
+        "mesh": {"num_faces": 2000, "watertight": True},
+        "total_seconds": 3.4,
+        "error": {"visible": None, "whole": {"chamfer_percent": 0.123}},
+    }
+    lines = ["2,000 triangles, closed", "Error of the whole: 0.12 % of the size", "Computed in 3 s"]
+    read = sidebar.part("result_numbers").result_lines
+
+    def shown() -> list[str]:
+        path.write_text(json.dumps(report))
+        os.utime(path, ns=(len(json.dumps(report)),) * 2)  # each is another file
+        found = list(read(sidebar.folder / "job"))
+        texts = sidebar.draw_all()["FEWVIEW_PT_result"].texts()
+        assert texts[1 : 1 + len(found)] == found
+        return found
+
+    assert shown() == lines
+    del report["error"]["visible"]
+    assert shown() == lines
+    report["error"] = None
+    assert shown() == [lines[0], lines[2]]
+    report["mesh"]["watertight"] = False
+    assert shown() == ["2,000 triangles, open", lines[2]]
+    report["mesh"]["watertight"] = "perhaps"
+    assert shown() == ["2,000 triangles", lines[2]]
+    del report["error"], report["total_seconds"], report["mesh"]["watertight"]
+    assert shown() == ["2,000 triangles"]
+    del report["mesh"]
+    assert shown() == []
 
 
 @pytest.mark.parametrize(
@@ -660,21 +719,28 @@ def test_a_result_that_is_no_mesh_any_more(sidebar: Sidebar) -> None:
 
 
 def test_past_jobs_can_be_imported(sidebar: Sidebar) -> None:
-    assert "None in the output folder" in sidebar.draw_all()["FEWVIEW_PT_past_jobs"].texts()
+    layout = sidebar.draw_all()["FEWVIEW_PT_past_jobs"]
+    assert layout.texts() == ["None in the output folder", "Import Result..."]
+    assert not hasattr(layout.drawn[-1].button, "folder")
     folders = [sidebar.folder / "jobs" / f"reconstruct-{number:03d}" for number in range(12)]
     for folder in folders:
         (folder / "result").mkdir(parents=True)
         (folder / "result" / "mesh.ply").touch()
-        asked = {"protocol": 1, "images": ["a.png"] * 4, "output": "result", "preset": "fast"}
+        images = ["photos"] if folder == folders[5] else ["a.png"] * 4
+        asked = {"protocol": 1, "images": images, "output": "result", "preset": "fast"}
         (folder / "job.json").write_text(json.dumps(asked))
     os.utime(folders[3] / "result" / "mesh.ply", (2e9, 2e9))
+    os.utime(folders[5] / "result" / "mesh.ply", (1.9e9, 1.9e9))
     buttons = [d for d in sidebar.draw_all()["FEWVIEW_PT_past_jobs"].drawn if d.kind == "operator"]
-    assert len(buttons) == 8
+    assert len(buttons) == 8 + 1
     assert (buttons[0].what, buttons[0].text) == (
         "fewview.import_result",
         "reconstruct-003: fast, 4 images",
     )
     assert buttons[0].button.folder == str(folders[3])
+    assert buttons[1].text == "reconstruct-005: fast"  # how many lie in a folder is not known
+    assert (buttons[-1].what, buttons[-1].text) == ("fewview.import_result", "Import Result...")
+    assert not hasattr(buttons[-1].button, "folder")  # it opens a file browser
 
 
 def test_points_alone_have_a_box(sidebar: Sidebar) -> None:

@@ -279,3 +279,6 @@ def test_the_backend_makes_a_closed_surface_near_a_sphere(part: Part, tmp_path: 
     positions = np.array([vertex.co for vertex in result.data.vertices])
     radii = np.linalg.norm(positions - [10, 0, -4], axis=1)
     np.testing.assert_allclose(radii, 2.0, rtol=0.03)
+    lines = part("result_numbers").result_lines(Path(result["fewview_job"]))
+    assert lines[0] == f"{len(result.data.polygons):,} triangles, closed"
+    assert [line.split()[0] for line in lines[1:]] == ["Computed"]

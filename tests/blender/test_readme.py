@@ -122,6 +122,15 @@ def test_what_is_left_out_is_not_the_panels(rehearsed: object, parts: Callable[[
     assert done.warnings
 
 
+def test_no_images_and_missing_ones_are_said(parts: Callable[[str], ModuleType], tmp_path: Path) -> None:
+    reconstruct = parts("api").reconstruct
+    with pytest.raises(ValueError, match="There are no images: give files or folders"):
+        reconstruct([], output=tmp_path / "jobs")
+    with pytest.raises(ValueError, match=r"There is nothing at .*nowhere: check the path"):
+        reconstruct([tmp_path / "nowhere"], output=tmp_path / "jobs")
+    assert not (tmp_path / "jobs").exists()
+
+
 @pytest.mark.parametrize(
     ("words", "said"),
     [

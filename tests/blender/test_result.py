@@ -243,6 +243,37 @@ def test_folders_that_are_no_jobs_are_refused(tmp_path: Path) -> None:
         bpy.ops.fewview.import_result()
 
 
+def test_a_result_from_anywhere_is_chosen_in_the_file_browser(
+    make_job: JobMaker, parts: SimpleNamespace, tmp_path: Path
+) -> None:
+    job, other = make_job("reconstruct-001"), make_job("reconstruct-002")
+    module = importlib.import_module(f"{parts.jobs.__package__}.operators.result")
+    operator = module.FEWVIEW_OT_import_result
+    bpy.context.scene.fewview.output = str(tmp_path / "jobs")
+    opened: list[object] = []
+    context = SimpleNamespace(
+        scene=bpy.context.scene,
+        preferences=bpy.context.preferences,
+        window_manager=SimpleNamespace(fileselect_add=opened.append),
+    )
+    executed = {"FINISHED"}
+    pressed = SimpleNamespace(folder=str(job), directory="", execute=lambda _: executed)
+    assert operator.invoke(pressed, context, None) == executed  # a past job's button
+    assert not opened
+    pressed.folder = ""
+    assert operator.invoke(pressed, context, None) == {"RUNNING_MODAL"}
+    assert opened == [pressed]
+    assert Path(pressed.directory) == tmp_path / "jobs"
+
+    assert bpy.ops.fewview.import_result(directory=f"{job}/") == {"FINISHED"}  # as the browser has it
+    assert bpy.context.scene.fewview.result["fewview_job"] == str(job)
+    assert bpy.ops.fewview.import_result(folder=str(other), directory=f"{job}/") == {"FINISHED"}
+    assert bpy.context.scene.fewview.result["fewview_job"] == str(other)
+    rna = bpy.ops.fewview.import_result.get_rna_type().properties
+    assert rna["directory"].is_hidden
+    assert rna["folder"].is_hidden  # in the browser the two would contradict each other
+
+
 def test_faces_that_blender_cannot_bear_are_left_out(make_job: JobMaker) -> None:
     folder = make_job()
     vertices, faces = sphere()
@@ -629,6 +660,9 @@ def test_the_report_is_opened(make_job: JobMaker, monkeypatch: pytest.MonkeyPatc
     (folder / "result/report.html").unlink()
     (folder / "result/report.html").symlink_to("/etc/hostname")
     with pytest.raises(RuntimeError, match="outside"):
+        bpy.ops.fewview.open_report()
+    (folder / "result/report.html").unlink()
+    with pytest.raises(RuntimeError, match=r"has no report\.html: .* press Open Folder$"):
         bpy.ops.fewview.open_report()
 
 
