@@ -4,12 +4,13 @@ import argparse
 import math
 import sys
 from collections.abc import Sequence
+from dataclasses import replace
 from datetime import UTC, datetime
 from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ..benchmark.suites import SUITES, Found, find_cases, with_budget
+from ..benchmark.suites import SUITES, Found, Suite, find_cases, with_budget
 from ..errors import ErrorCode, ReconstructionError
 from ..wire.client import backend_command
 from ..wire.protocol import DEVICES, PRESETS
@@ -33,6 +34,7 @@ def add_benchmark(parser: argparse.ArgumentParser) -> None:
     )
     add("--scenes", metavar="DIR", type=Path, help="the suite's scenes, as make renders them")
     add("--photos", metavar="DIR", type=Path, help="the sets of real photographs")
+    add("--cases", nargs="+", metavar="CASE", help="of the suite, only these")
     add("--presets", nargs="+", choices=PRESETS, default=["fast", "balanced"])
     add("--seeds", type=_count, metavar="N", default=3, help="how often to run everything (3)")
     add(
@@ -76,7 +78,8 @@ def _measure_all(parsed: argparse.Namespace, program: tuple[str, ...], request: 
     from ..benchmark.writing import machine_facts, write_results
     from ..machine import choose_device
 
-    found = find_cases(SUITES[parsed.suite], parsed.scenes, parsed.photos)
+    suite = SUITES[parsed.suite]
+    found = find_cases(_chosen(suite, parsed.cases), parsed.scenes, parsed.photos)
     _check(parsed, found)
     device = choose_device(parsed.device).type
     budgets_s = parsed.budgets if parsed.only_budgets else [None, *parsed.budgets]
@@ -94,7 +97,8 @@ def _measure_all(parsed: argparse.Namespace, program: tuple[str, ...], request: 
         for case, folder in found.cases
         for preset, budget_s, seed in product(parsed.presets, budgets_s, range(parsed.seeds))
     ]
-    runs = measured_before(parsed.output, found, machine)
+    # those of cases that are not asked for now stay
+    runs = measured_before(parsed.output, find_cases(suite, parsed.scenes, parsed.photos), machine)
 
     def measured() -> list["Measurement"]:
         asked_first = dict.fromkeys((*trials, *runs))
@@ -122,6 +126,20 @@ def _measure_all(parsed: argparse.Namespace, program: tuple[str, ...], request: 
         everything = {**about, **_asked(measured())}
         write_record(parsed.record, everything, measured(), code=measuring_fingerprint(), date=today)
     sys.stdout.write(f"{parsed.output / 'table.md'}\n")
+
+
+def _chosen(suite: Suite, names: Sequence[str] | None) -> Suite:
+    """The suite with the cases of these names alone, or all of it."""
+    if names is None:
+        return suite
+    cases = {case.name: case for case in suite.cases}
+    if unknown := [name for name in names if name not in cases]:
+        raise ReconstructionError(
+            ErrorCode.SETTINGS_INVALID,
+            f"The suite {suite.name} has no case {', '.join(unknown)}.",
+            f"It has {', '.join(cases)}.",
+        )
+    return replace(suite, cases=tuple(cases[name] for name in names))
 
 
 def _asked(runs: Sequence["Measurement"]) -> dict[str, object]:

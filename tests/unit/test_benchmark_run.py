@@ -3,6 +3,7 @@
 import json
 import sys
 from argparse import ArgumentParser, Namespace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -131,6 +132,23 @@ def test_what_earlier_calls_asked_for_is_told_with_their_runs(photos: Path, tmp_
         results = json.loads(path.read_text())
         assert sorted(results["presets"]) == ["balanced", "fast"]
         assert (results["budgets_s"], results["seeds"]) == ([10.0], [0])
+
+
+def test_cases_can_be_chosen_and_those_of_before_stay(
+    photos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    other = replace(CASE, name="other")
+    monkeypatch.setattr(command, "SUITES", {**command.SUITES, "toy": Suite(name="toy", cases=(CASE, other))})
+    output = tmp_path / "out"
+    for name, expected in (("other", ["other"]), ("toy", ["toy", "other"])):
+        words = parsed(photos, output, "--seeds", "1", "--presets", "fast", "--cases", name)
+        assert command.benchmark(words, program=fake_program()) == EXIT_FINE
+        results = json.loads((output / "results.json").read_text())
+        assert [run["case"] for run in results["runs"]] == expected
+    assert (
+        command.benchmark(parsed(photos, output, "--cases", "toi"), program=fake_program()) == EXIT_USER_ERROR
+    )
+    assert "no case toi" in capsys.readouterr().err
 
 
 def test_what_has_no_end_is_run_with_budgets_only(
