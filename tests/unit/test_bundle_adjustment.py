@@ -205,6 +205,11 @@ def test_triangulation_by_three_ways() -> None:
     best = adjusted(seen, case.poses, case.points, cameras_free=False)
     sigma = NOISE_PX * best.covariance.diagonal()[12:-4].unflatten(0, (-1, 3)).sum(1).sqrt().numpy()
     middle, good = two_view_points(a, b, noisy[0], noisy[1])
+    # pycolmap's is the linear one, of coordinates in the camera instead of pixels
+    rays = (noisy - np.array(LENS[1:3])) / LENS[0]
+    poses = [camera.camera_from_world[:3] for camera in (a, b)]
+    colmap = np.array([pycolmap.triangulate_point(*poses, *pair) for pair in rays.transpose(1, 0, 2)[good]])
+    assert np.median(np.linalg.norm(colmap - best.points.numpy()[good], axis=1) / sigma[good]) < 0.2
     off = np.linalg.norm(middle - best.points.numpy(), axis=1) / sigma
     assert np.median(off[good]) < 0.2
     linear = torch.stack(

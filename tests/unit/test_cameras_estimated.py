@@ -1,8 +1,11 @@
 """Cameras from photographs of a rendered corner, and lens refinement on synthetic points."""
 
+import json
 import math
 from dataclasses import replace
+from itertools import combinations
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import PIL.Image  # noqa: F401 - before pycolmap
@@ -13,8 +16,10 @@ from scipy.spatial.transform import Rotation
 
 from backend.errors import Cancelled, ErrorCode, ReconstructionError
 from backend.scene import Photo, SolvedCameras, no_progress
+from backend.stages.camera_report import build_camera_report, camera_report_html, camera_report_numbers
 from backend.stages.cameras import CamerasConfig, solve_cameras
 from backend.stages.lens_refinement import Gaussian, joined, refine_lenses
+from backend.stages.region import RegionConfig, find_region
 from tests.ridge_photos import FOCAL_PX, HEIGHT, WIDTH, arc_pose, look_at_origin, make_photo, render
 
 CONFIG = CamerasConfig(max_features=1200)
@@ -84,6 +89,38 @@ def check_evidence(solved: SolvedCameras) -> None:
         assert (np.linalg.eigvalsh(covariance) > -1e-15).all()
         turn_deg = np.degrees(np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1]))
         assert 0.003 < turn_deg < 3, "true errors are about 0.1 degrees"
+
+
+def test_the_page_tells_what_the_solve_found(corner: list[Photo], tmp_path: Path) -> None:
+    """In the order and the units of the record, photograph by photograph."""
+    solved = solve([*corner, noise_photo("noise.png", 5)], tmp_path)
+    region = find_region(solved, RegionConfig(), progress=no_progress)
+    report = build_camera_report(solved, region, job_name="ridge", seed=0, versions={})
+    numbers: dict[str, Any] = json.loads(json.dumps(camera_report_numbers(report)))
+    facts = {photo["name"]: photo for photo in numbers["photos"]}
+    evidence, seen = solved.evidence, solved.sparse_visibility
+    assert evidence is not None
+    assert evidence.pose_covariance is not None
+    for index, view in enumerate(solved.views):
+        told = facts[view.name]
+        assert told["why_unplaced"] is None
+        assert told["num_points"] == seen[:, index].sum()
+        errors_px = evidence.error_px[seen[:, index], index]
+        assert told["median_error_px"] == pytest.approx(np.median(errors_px))
+        turn = np.sqrt(np.linalg.eigvalsh(evidence.pose_covariance[index, :3, :3])[-1])
+        assert told["turn_sigma_deg"] == pytest.approx(math.degrees(turn))
+        assert numbers["pose_covariance_rad_world"][view.name] == evidence.pose_covariance[index].tolist()
+    assert facts["noise.png"]["why_unplaced"] == solved.unplaced[0].why
+    place = {name: index for index, name in enumerate(evidence.names)}
+    assert {frozenset((pair["one"], pair["other"])) for pair in numbers["pairs"]} >= {
+        frozenset(pair) for pair in combinations(POSES, 2)
+    }
+    for pair in numbers["pairs"]:
+        assert pair["num_verified"] == evidence.num_verified[place[pair["one"]], place[pair["other"]]]
+    assert sum(numbers["track_lengths"].values()) == sum(numbers["angle_counts"]) == len(seen)
+    assert 14 < numbers["median_angle_deg"] < 34, "the photographs are 15 and 18 degrees apart"
+    html = camera_report_html(report)
+    assert all(name in html for name in (*POSES, "noise.png", f"{len(seen):,}"))
 
 
 def test_the_mean_error_is_in_each_photograph_s_own_pixels(corner: list[Photo], tmp_path: Path) -> None:
