@@ -73,7 +73,9 @@ def merged_points(
     *,
     correlated: bool = False,
 ) -> tuple[Float[Tensor, "merged 3"], Float[Tensor, "merged 3"], Float[Tensor, "merged"]]:
-    """Points that share a cube of side `cell` and face the same way as one: means, and the confidence's sum.
+    """Points that share a cube and face the same way as one: means, and the confidence's sum.
+
+    Positions and `cell`, the side of a cube, are in the same unit, such as that of the object frame.
 
     The same way is the same side of a die, so that the two faces of a thin sheet stay apart. If the errors
     of neighbours are `correlated`, more points are not more evidence: the confidence is the mean, in which
@@ -154,6 +156,6 @@ def off_silhouette(
 def seen_through(
     camera: Pinhole, depth_map: Float[Tensor, "height width"], margin: float, nodes: int
 ) -> Bool[Tensor, "nodes nodes nodes"]:
-    """Nodes that lie in front of what the photograph measured, by more than `margin`."""
+    """Nodes that lie in front of what the photograph measured, by more than `margin`; object units."""
     measured, depth, shown = read_at_nodes(camera, depth_map, nodes, mode="nearest")
     return shown & (measured > 0) & (depth < measured - margin)

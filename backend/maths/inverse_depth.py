@@ -116,7 +116,7 @@ def distance_from_edges_px(
 ) -> Float[Tensor, "height width"]:
     """Distance of every pixel to the nearest that is off the subject or beside a jump; 0 on those.
 
-    A jump is where neighbours differ by more than `largest_step` of either. Without any edge it is
+    A jump is where neighbours differ by more than `largest_step` of either, in the unit of `inverse_depth`. Without any edge it is
     the sum of the picture's sides.
     """
     smooth = subject.clone()

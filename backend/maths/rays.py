@@ -26,7 +26,7 @@ def points_along(
     directions: Float[Tensor, "rays 3"],
     along: Float[Tensor, "rays samples"],
 ) -> Float[Tensor, "rays samples 3"]:
-    """o + t d for every ray at each of its own t."""
+    """o + t d for every ray at each of its own t, in lengths of d; in the frame of the origins."""
     return origins[:, None] + along[..., None] * directions[:, None]
 
 
@@ -59,6 +59,8 @@ def first_crossing(
     steps: int = 40,
 ) -> Crossing:
     """Sphere tracing from `start`, `shortest` to `longest` a step; the crossing by the secant.
+
+    Directions are unit vectors; all lengths are in the unit of the origins, as the distance is.
 
     Far from the surface a fitted field may grow faster than the distance, and whole steps would leap over it.
 

@@ -15,7 +15,8 @@ def aggregate(
 ) -> Float[Tensor, "height width planes"]:
     """Sum of the path costs along four directions; lowest at the plane to choose.
 
-    `large_step` may vary over the image (cheaper across its edges).
+    `small_step` is what it costs to go to the next plane, `large_step` to any other, in the cost's unit; the
+    latter may vary over the image (cheaper across its edges).
     """
     total = _scan_rows(cost, small_step, large_step)
     total += _scan_rows(cost.flip(0), small_step, large_step.flip(0)).flip(0)

@@ -23,7 +23,11 @@ def fit_smooth(
     smoothness: float,
     steps: int,
 ) -> Float[Tensor, "nodes nodes nodes"]:
-    """`steps` of conjugate gradients with the diagonal as preconditioner, from `start`."""
+    """What minimises the energy above, on the nodes: `steps` of conjugate gradients from `start`.
+
+    Values and targets share one unit; weights and smoothness count beside each other. The diagonal is the
+    preconditioner.
+    """
     if weight.device.type == "cpu" and weight.dtype == torch.float32:
         solution = bending.conjugate_gradients(
             floats(weight),

@@ -25,6 +25,8 @@ def surface_samples(
 ) -> Float[Tensor, "rays edges"]:
     """Distances from the origin, ascending: `uniform` over the span, then rounds where the surface may be.
 
+    Directions are unit vectors; origins, span and the field's values share one unit of length.
+
     NeuS (arXiv:2106.10689), section 3.3: each round weighs the intervals so far as if the field were
     rendered with a sharpness of 64, 128, ..., whatever has been learned. The field is asked at the
     intervals' ends, so the weights are eq. 13 itself and need no guess at slopes. Without a generator
