@@ -93,8 +93,8 @@ def correlation(
 ) -> Float[Tensor, "planes height width"]:
     """Normalised cross-correlation of patches, in [-1, 1], shrunk towards 0 where there is only noise.
 
-    `noise` is the standard deviation that sensor and coding leave in a flat patch, in the images' unit; its variance
-    joins the denominator, so that flat patches score low whatever they are compared with.
+    `noise` is the standard deviation that sensor and coding leave in a flat patch, in the images' unit; its
+    variance joins the denominator, so that flat patches score low whatever they are compared with.
     """
     weighted = warped * reference.subject
     products = torch.stack([weighted, weighted * warped, weighted * reference.image])

@@ -116,8 +116,8 @@ def distance_from_edges_px(
 ) -> Float[Tensor, "height width"]:
     """Distance of every pixel to the nearest that is off the subject or beside a jump; 0 on those.
 
-    A jump is where neighbours differ by more than `largest_step` of either, in the unit of `inverse_depth`. Without any edge it is
-    the sum of the picture's sides.
+    A jump is where neighbours differ by more than `largest_step` of either, in the unit of `inverse_depth`.
+    Without any edge it is the sum of the picture's sides.
     """
     smooth = subject.clone()
     for one, other in ((np.s_[1:], np.s_[:-1]), (np.s_[:, 1:], np.s_[:, :-1])):
