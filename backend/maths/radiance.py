@@ -36,6 +36,15 @@ def composite(
     return torch.einsum("ri,ric->rc", blending_weights(log_pass), colour) + through[:, None] * background
 
 
+def mean_colour(
+    log_pass: Float[Tensor, "rays intervals"], colour: Float[Tensor, "rays intervals channels"]
+) -> Float[Tensor, "rays channels"]:
+    """Of what is opaque on a ray, whatever is behind; darker where its opacity is below a thousandth."""
+    weights = blending_weights(log_pass)
+    opacity = weights.sum(dim=-1, keepdim=True)
+    return torch.einsum("ri,ric->rc", weights, colour) / opacity.clamp(min=1e-3)
+
+
 def weight_bound(
     edges: Float[Tensor, "rays edges"],
     proposal_edges: Float[Tensor, "rays proposal_edges"],

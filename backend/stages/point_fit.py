@@ -20,7 +20,7 @@ from ..maths.neighbours import against_neighbours, neighbour_planes, trusts
 from ..maths.sides import Sides, sides_by_walking
 from ..maths.smooth_fit import fit_smooth
 from ..point_methods import PointMethod
-from ..scene import Decision, Progress, to_unit_sphere, transform_points, within
+from ..scene import Decision, Progress, to_unit_sphere, within
 from .point_cloud import PointCloud
 from .point_network import LearnedField, NetworkConfig, fit_network
 from .safe_steps import not_finite
@@ -113,8 +113,9 @@ def fit_points(
         positions, normals = positions[drawn], None if normals is None else normals[drawn]
     trust = trusts(positions)
     low, high = _extent(positions[trust > _SURE])
-    frame = to_unit_sphere((low + high) / 2, _MARGIN * float((high - low).max()) / 2)
-    placed = transform_points(frame, positions)
+    middle, half = (low + high) / 2, _MARGIN * float((high - low).max()) / 2
+    frame = to_unit_sphere(middle, half)
+    placed = (positions - middle) / half  # not by the frame, in which digits cancel far from the origin
     near = (np.abs(placed) < 1).all(axis=1)
     placed, trust = placed[near], trust[near]
     if config.method == PointMethod.LINEAR:

@@ -13,8 +13,9 @@ from torch import Tensor
 
 from ..maths import losses
 from ..maths.grid import laplacian_at, read, spacing, splat
+from ..maths.radiance import mean_colour
 from ..maths.rays import first_crossing, points_along, sphere_entry
-from ..maths.volume import blending_weights, log_transmittance, log_transparency
+from ..maths.volume import log_transmittance, log_transparency
 from ..scene import Progress
 from .deadline import Deadline
 from .field import SurfaceField
@@ -128,7 +129,6 @@ def _ray_loss(
     points = points_along(origins, directions, along)
     distances = field.distance(field.locate(points.reshape(-1, 3))).reshape(along.shape)
     log_pass = log_transmittance(distances, sharpness)
-    weights = blending_weights(log_pass)
 
     middles = (points[:, 1:] + points[:, :-1]) / 2
     corners = field.locate(middles.reshape(-1, 3))
@@ -136,11 +136,11 @@ def _ray_loss(
     normal = F.normalize(gradient, dim=-1, eps=1e-3)
     towards = directions[:, None].expand_as(middles).reshape(-1, 3)
     colour = field.colour(corners, normal, towards).reshape(*middles.shape)
-    opacity = weights.sum(dim=-1)
-    rendered = torch.einsum("ri,ric->rc", weights, colour) / opacity.clamp(min=1e-3)[:, None]
+    rendered = mean_colour(log_pass, colour)
+    opacity = -torch.expm1(log_transparency(log_pass).detach())
     coverage = pixels.coverage[chosen]
     masked = ~coverage.isnan()
-    trust = torch.where(masked, coverage, 1.0) * opacity.detach() * crossing.hit
+    trust = torch.where(masked, coverage, 1.0) * opacity * crossing.hit
     difference = losses.charbonnier(rendered - pixels.colour[chosen], 0.02).mean(dim=-1)
     loss = (trust * difference).mean() + 0.1 * losses.eikonal(gradient)
     if masked.any():

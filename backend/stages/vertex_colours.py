@@ -56,7 +56,7 @@ def colour_vertices(
     colours = (share[..., None] * srgb).sum(axis=0) / np.where(known, weight, 1.0)[:, None]
     if known.any() and not known.all():
         distance, nearest = nearest_tree(vertices[known]).query(vertices[~known], k=min(16, int(known.sum())))
-        near = 1 / (np.atleast_2d(distance.T).T + 1e-3 * np.ptp(vertices))
+        near = 1 / (np.atleast_2d(distance.T).T + 1e-3 * np.ptp(vertices, axis=0).max())
         mixed = (near[..., None] * colours[known][np.atleast_2d(nearest.T).T]).sum(axis=1)
         colours[~known] = mixed / near.sum(axis=1, keepdims=True)
     return np.clip(colours * 255 + 0.5, 0, 255).astype(np.uint8), decision

@@ -5,7 +5,7 @@ Small photographs and a coarse grid: a cell is 3 % of the body's diagonal wide.
 
 import signal
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import cache
 from pathlib import Path
 
@@ -18,16 +18,30 @@ from backend.errors import ErrorCode, ReconstructionError
 from backend.maths.correlation import correlation, patch_statistics
 from backend.maths.evidence import merged_points
 from backend.maths.nearest import nearest_tree
-from backend.scene import Photo, SolvedCameras, SurfaceMesh, SurfacePoints, no_progress
+from backend.maths.projection import projected, shown
+from backend.scene import (
+    Photo,
+    SolvedCameras,
+    SurfaceMesh,
+    SurfacePoints,
+    View,
+    no_progress,
+    transform_points,
+)
+from backend.stages import patch_agreement
 from backend.stages.cameras import CamerasConfig, solve_cameras
+from backend.stages.cross_check import cross_check
 from backend.stages.mesh import MeshConfig, extract_mesh
+from backend.stages.patch_agreement import in_torch as agreement_in_torch
 from backend.stages.point_cloud import read_cloud
 from backend.stages.region import RegionConfig, find_region
 from backend.stages.stereo import match_views
 from backend.stages.stereo_config import StereoConfig
+from backend.stages.stereo_windows import Window, pyramid
 from backend.stages.strays import strays, without_strays
 from backend.stages.train import TrainConfig, fit_surface
 from tests import synthetic_scene
+from tests.stability.surfaces import from_surface
 from tests.synthetic_scene import (
     CENTRE,
     SIZE,
@@ -39,6 +53,8 @@ from tests.synthetic_scene import (
     surface_distance,
     surface_points,
     texture_srgb,
+    true_mesh,
+    true_region,
 )
 
 pytestmark = [
@@ -92,14 +108,43 @@ def reconstructed(solved: SolvedCameras, changed: Points = as_they_are) -> Surfa
     return extract_mesh(solved.views, region, stereo, surface, MeshConfig(), progress=no_progress)
 
 
-def check_sensible(mesh: SurfaceMesh, most_percent: float) -> None:
-    """Finite, closed, and near the body where it says so: median error in percent of the diagonal."""
+@dataclass(frozen=True, kw_only=True)
+class Limits:
+    """Of errors in percent of the body's diagonal, about twice what is seen."""
+
+    median: float = 0.3
+    """Over the vertices that are said to be measured."""
+    measured: float = 1.2
+    """Nineteen in twenty of them."""
+    all: float = 2.0
+    """Nineteen in twenty of all vertices."""
+    body: float = 2.5
+    """The distance from the mesh of nineteen in twenty places of the body."""
+
+
+WITH_MASKS = Limits()
+WITHOUT_MASKS = Limits(measured=3.5, all=16, body=18)
+"""What six photographs do not show has no outline either, and is guessed as far as the region goes."""
+
+
+def check_sensible(mesh: SurfaceMesh, limits: Limits) -> None:
+    """Finite, closed, near the body, nearer where it says that it is, and all of the body near to it."""
     for values in (mesh.vertices, mesh.normals, mesh.support):
         assert np.isfinite(values).all()
     assert trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).is_watertight
-    sure = mesh.support > 0.5
-    assert sure.mean() > 0.05
-    assert 100 * np.median(np.abs(surface_distance(mesh.vertices[sure]))) / diagonal() < most_percent
+    off = 100 * np.abs(surface_distance(mesh.vertices)) / diagonal()
+    measured = off[mesh.support > 0.5]
+    assert len(measured) > 0.05 * len(off)
+    body = np.asarray(true_mesh().vertices)[::8]
+    from_body = 100 * from_surface(body, mesh.vertices, mesh.faces) / diagonal()
+    seen = Limits(
+        median=float(np.median(measured)),
+        measured=float(np.quantile(measured, 0.95)),
+        all=float(np.quantile(off, 0.95)),
+        body=float(np.quantile(from_body, 0.95)),
+    )
+    too_far = {name: value for name, value in asdict(seen).items() if value > asdict(limits)[name]}
+    assert not too_far, f"{seen}, but {limits}"
 
 
 @cache
@@ -171,19 +216,21 @@ class Spoiled:
 
     scene: Callable[[], Scene]
     change: Callable[[int, Image], Image]
-    becomes: ErrorCode | float
+    becomes: ErrorCode | Limits
 
 
 PHOTOGRAPHS = {
-    "good ones": Spoiled(scene=masked, change=lambda _, image: image, becomes=0.3),
-    "good ones without masks": Spoiled(scene=unmasked, change=lambda _, image: image, becomes=0.3),
+    "good ones": Spoiled(scene=masked, change=lambda _, image: image, becomes=WITH_MASKS),
+    "good ones without masks": Spoiled(scene=unmasked, change=lambda _, image: image, becomes=WITHOUT_MASKS),
     "constant without masks": Spoiled(scene=unmasked, change=constant, becomes=ErrorCode.NO_SURFACE),
-    "overexposed": Spoiled(scene=masked, change=overexposed, becomes=0.3),
-    "overexposed without masks": Spoiled(scene=unmasked, change=overexposed, becomes=0.3),
-    "one black": Spoiled(scene=masked, change=one_black, becomes=0.3),
-    "one black without masks": Spoiled(scene=unmasked, change=one_black, becomes=0.3),
-    "something moving": Spoiled(scene=masked, change=with_something_moving, becomes=0.3),
-    "something moving, no masks": Spoiled(scene=unmasked, change=with_something_moving, becomes=0.3),
+    "overexposed": Spoiled(scene=masked, change=overexposed, becomes=WITH_MASKS),
+    "overexposed without masks": Spoiled(scene=unmasked, change=overexposed, becomes=WITHOUT_MASKS),
+    "one black": Spoiled(scene=masked, change=one_black, becomes=WITH_MASKS),
+    "one black without masks": Spoiled(scene=unmasked, change=one_black, becomes=WITHOUT_MASKS),
+    "something moving": Spoiled(scene=masked, change=with_something_moving, becomes=WITH_MASKS),
+    "something moving, no masks": Spoiled(
+        scene=unmasked, change=with_something_moving, becomes=WITHOUT_MASKS
+    ),
     "not a number": Spoiled(scene=masked, change=not_a_number, becomes=ErrorCode.NO_SURFACE),
 }
 
@@ -191,7 +238,7 @@ PHOTOGRAPHS = {
 @pytest.mark.parametrize("case", PHOTOGRAPHS.values(), ids=PHOTOGRAPHS.keys())
 def test_spoiled_photographs(case: Spoiled) -> None:
     solved = with_images(case.scene(), case.change).solved(sparse_points())
-    if isinstance(case.becomes, float):
+    if isinstance(case.becomes, Limits):
         check_sensible(reconstructed(solved), case.becomes)
         return
     with pytest.raises(ReconstructionError) as raised:
@@ -234,21 +281,17 @@ def test_textures_that_repeat(
     monkeypatch.setattr(synthetic_scene, "texture_srgb", texture)
     scene = photographed(ring_cameras(6, 80), wall=wall)
     scene = scene.without_masks() if wall else scene
-    check_sensible(reconstructed(scene.solved(sparse_points())), 0.3)
+    check_sensible(reconstructed(scene.solved(sparse_points())), WITHOUT_MASKS if wall else WITH_MASKS)
 
 
-def placed_or_refused(photos: list[Photo], workdir: Path) -> SolvedCameras | ReconstructionError:
-    try:
-        return solve_cameras(photos, None, CamerasConfig(), workdir=workdir, seed=0, progress=no_progress)
-    except ReconstructionError as error:
-        return error
-
-
-@pytest.mark.parametrize("texture", [stripes_srgb, mirrored_srgb])
+@pytest.mark.parametrize(("texture", "most_deg"), [(stripes_srgb, 1.0), (mirrored_srgb, 0.7)])
 def test_cameras_of_textures_that_repeat(
-    texture: Callable[[np.ndarray], np.ndarray], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    texture: Callable[[np.ndarray], np.ndarray],
+    most_deg: float,
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
 ) -> None:
-    """Photographs without cameras: those that are placed are placed right, or an error says what to do."""
+    """Photographs without cameras: all of them are placed, and right."""
     monkeypatch.setattr(synthetic_scene, "texture_srgb", texture)
     cameras = arc_cameras(4, 40, 320)
     photos = [
@@ -263,18 +306,72 @@ def test_cameras_of_textures_that_repeat(
         )
         for view in photographed(cameras).views
     ]
-    solved = placed_or_refused(photos, tmp_path)
-    if isinstance(solved, ReconstructionError):
-        assert solved.code in (ErrorCode.NO_OVERLAP, ErrorCode.TOO_FEW_PLACED, ErrorCode.NO_PARALLAX)
-        assert "photo" in solved.remedy.lower(), "what to take instead"
-        return
+    solved = solve_cameras(photos, None, CamerasConfig(), workdir=tmp_path, seed=0, progress=no_progress)
+    assert (len(solved.views), solved.unplaced) == (4, ())
     true = {photo.name: camera for photo, camera in zip(photos, cameras, strict=True)}
     first = solved.views[0]
     for view in solved.views[1:]:
         turned = view.camera.camera_from_world @ np.linalg.inv(first.camera.camera_from_world)
         truly = true[view.name].camera_from_world @ np.linalg.inv(true[first.name].camera_from_world)
         cosine = (np.trace(turned[:3, :3] @ truly[:3, :3].T) - 1) / 2
-        assert np.degrees(np.arccos(min(cosine, 1.0))) < 1.0
+        assert np.degrees(np.arccos(min(cosine, 1.0))) < most_deg
+
+
+def first_windows(scene: Scene) -> list[Window]:
+    return [pyramid(view, true_region(), StereoConfig(), CPU)[0] for view in scene.views]
+
+
+def true_inverse_depth(scene: Scene, view: int, window: Window) -> torch.Tensor:
+    """Of the window's pixels, object frame; 0 off the body."""
+    height, width = window.grey.shape
+    rows, columns = slice(window.top, window.top + height), slice(window.left, window.left + width)
+    found = true_region().radius_world / scene.depths[view][rows, columns]
+    return torch.tensor(found, dtype=torch.float32)
+
+
+def test_the_mean_over_sources_believes_a_black_one_and_the_soft_maximum_does_not(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """At the true depth, between one good source and a black one; 0.98 is seen, and by the mean 0.49."""
+    scene = photographed(arc_cameras(3, 40, 80))
+    good, black = first_windows(scene), first_windows(with_images(scene, one_black))
+    there = true_inverse_depth(scene, 1, good[1])
+    on = good[1].subject & (there > 0)
+
+    def agreed(windows: list[Window]) -> float:
+        found = agreement_in_torch(windows[1], [windows[0], windows[2]], there.clamp(min=0.1)[None], on)
+        return float(found[0][on].median())
+
+    assert agreed(good) > 0.9
+    assert agreed(black) > 0.85
+    monkeypatch.setattr(patch_agreement, "_SELECTIVITY", 1e9)  # all sources weigh alike
+    assert agreed(good) > 0.9
+    assert agreed(black) < 0.55
+
+
+@pytest.mark.parametrize("texture", [stripes_srgb, mirrored_srgb])
+def test_best_matches_of_textures_that_repeat_are_right_where_the_other_photograph_agrees(
+    texture: Callable[[np.ndarray], np.ndarray], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The best of 128 depths, two photographs; 29 and 17 % are 3 % off, and 2.4 and 1.4 % of those left."""
+    monkeypatch.setattr(synthetic_scene, "texture_srgb", texture)
+    scene = photographed(arc_cameras(2, 30, 80))
+    windows = first_windows(scene)
+    depths = torch.linspace(1 / 6, 1 / 2.2, 128)
+    best = []
+    for window, other in (windows, windows[::-1]):
+        tried = depths[:, None, None].expand(-1, *window.grey.shape)
+        score, index = agreement_in_torch(window, [other], tried, window.subject).max(dim=0)
+        best.append(torch.stack([depths[index], score]))
+    there = true_inverse_depth(scene, 0, windows[0])
+    matched = (there > 0) & (best[0][1] > 0.3)
+    wrong = (best[0][0] / there - 1).abs() > 0.03
+    agrees, _ = cross_check(
+        windows[0].camera, best[0][0], windows[1].camera, best[1], least_score=0.3, largest_px=1.0
+    )
+    assert wrong[matched].float().mean() > 0.12
+    assert wrong[matched & agrees].float().mean() < 0.05
+    assert agrees[matched].float().mean() > 0.5
 
 
 # masks
@@ -286,12 +383,12 @@ def of_the_next_photograph(index: int, _mask: Image) -> Image:
     return mask
 
 
-MASKS: dict[str, tuple[Callable[[int, Image], Image], tuple[ErrorCode, ...] | float]] = {
+MASKS: dict[str, tuple[Callable[[int, Image], Image], tuple[ErrorCode, ...] | Limits]] = {
     "inverted": (lambda _, mask: 1 - mask, (ErrorCode.MASK_UNUSABLE, ErrorCode.NO_SURFACE)),
     "one inverted": (lambda i, mask: 1 - mask if i == 2 else mask, (ErrorCode.MASK_UNUSABLE,)),
     "empty": (lambda _, mask: 0 * mask, (ErrorCode.MASK_UNUSABLE,)),
     "one empty": (lambda i, mask: (i != 2) * mask, (ErrorCode.MASK_UNUSABLE,)),
-    "of another photograph": (of_the_next_photograph, 1.5),
+    "of another photograph": (of_the_next_photograph, Limits(median=1.5, measured=8, all=15, body=15)),
 }
 
 
@@ -299,12 +396,33 @@ MASKS: dict[str, tuple[Callable[[int, Image], Image], tuple[ErrorCode, ...] | fl
 def test_wrong_masks(case: str) -> None:
     change, becomes = MASKS[case]
     solved = with_masks(change).solved(sparse_points())
-    if isinstance(becomes, float):
+    if isinstance(becomes, Limits):
         check_sensible(reconstructed(solved), becomes)
         return
     with pytest.raises(ReconstructionError, match="mask") as raised:
         reconstructed(solved)
     assert raised.value.code in becomes
+
+
+def test_what_all_masks_have_in_common_is_nothing_of_the_body_if_one_is_inverted() -> None:
+    """Carved plainly; what is left lies beside the body. 99 % of it is left by right masks, now 0.05 %."""
+    grid = np.stack(np.meshgrid(*[np.linspace(-1, 1, 32)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+    places = transform_points(true_region().world_from_object, grid)
+
+    def carved(views: tuple[View, ...]) -> np.ndarray:
+        left = np.ones(len(places), bool)
+        for view in views:
+            assert view.mask is not None
+            pixels, depth = projected(places, view.camera)
+            seen = shown(pixels, depth, view.camera)
+            column, row = pixels[seen].astype(int).T
+            left[seen] &= view.mask[row, column] > 0.5
+        return left
+
+    body = surface_distance(places) < 0
+    assert carved(masked().views)[body].mean() > 0.95
+    invert, _ = MASKS["one inverted"]
+    assert carved(with_masks(invert).views)[body].mean() < 0.01
 
 
 # points
@@ -335,18 +453,18 @@ def again(points: SurfacePoints, times: int = 10) -> SurfacePoints:
 
 
 @pytest.mark.parametrize(
-    ("scene", "change", "most_percent"),
+    ("scene", "change", "limits"),
     [
-        (masked, with_outliers, 0.3),
-        (masked, flipped, 1.0),
-        (masked, again, 0.3),
-        (unmasked, with_outliers, 0.3),
+        (masked, with_outliers, WITH_MASKS),
+        (masked, flipped, Limits(median=1.0, measured=3, all=2.5, body=2.5)),
+        (masked, again, WITH_MASKS),
+        (unmasked, with_outliers, WITHOUT_MASKS),
         # half of the planes say the opposite: only what photographs see through tells the sides
-        (unmasked, flipped, 1.5),
+        (unmasked, flipped, Limits(median=1.5, measured=5, all=16, body=18)),
     ],
 )
-def test_wrong_points(scene: Callable[[], Scene], change: Points, most_percent: float) -> None:
-    check_sensible(reconstructed(scene().solved(sparse_points()), change), most_percent)
+def test_wrong_points(scene: Callable[[], Scene], change: Points, limits: Limits) -> None:
+    check_sensible(reconstructed(scene().solved(sparse_points()), change), limits)
 
 
 @cache

@@ -202,6 +202,37 @@ def hash_slope_error(encoded: Callable[[Tensor], Tensor]) -> float:
     return worst
 
 
+def hash_sum(points: Tensor) -> Tensor:
+    """The features' mean of each place, from 0 to 1: a field of differences."""
+    return hashed(points).mean(dim=-1)
+
+
+def difference_of(
+    field: Callable[[Tensor], Tensor], points: Tensor, step: float, *, over_twice: bool
+) -> Tensor:
+    """By the taps' distance, or by twice the step where a tap is moved to the box's side too."""
+    found = central_gradient(field, points, step)
+    apart = (points + step).clamp(-1, 1) - (points - step).clamp(-1, 1)
+    return found * apart / (2 * step) if over_twice else found
+
+
+def hash_difference_error(over_twice: bool) -> Errors:
+    """Over a cell of each level, on nodes, a digit beside them and on the box's sides; in 1 / step.
+
+    Against the same in float64.
+    """
+    errors = {"within": 0.0, "box's sides": 0.0}
+    for cells in CELLS:
+        points, step = border_points(cells + 1)[:1200].clamp(-1, 1), 2 / cells
+        found = difference_of(hash_sum, points, step, over_twice=over_twice)
+        exact = central_gradient(hash_sum, points.double(), step)
+        cut = (points.abs() > 1 - step).any(dim=-1)
+        for name, here in (("within", ~cut), ("box's sides", cut)):
+            if here.any():
+                errors[name] = max(errors[name], largest(found[here], exact[here], 1 / step))
+    return errors
+
+
 # lengths of gradients
 
 
@@ -267,6 +298,44 @@ def taylor_error(residual: Callable[[Tensor, Tensor, Tensor], Tensor]) -> Errors
             largest(value[here], exact[here], size[here] + exact[here].abs()),
             largest(by_g[here], exact_by_g[here], 1 + exact_by_g[here].norm(dim=-1, keepdim=True)),
         )
+    return errors
+
+
+def at_point_by_root(distance: Tensor, g: Tensor, offset: Tensor) -> Tensor:
+    """f(q) - |grad f(p)| n . (q - p), the length as the root of the sum of squares."""
+    return losses.taylor_at_point(distance, g.square().sum(dim=-1, keepdim=True).sqrt() * UP, offset)
+
+
+def at_point(distance: Tensor, g: Tensor, offset: Tensor) -> Tensor:
+    """As SparseCraft's loss here has it."""
+    return losses.taylor_at_point(distance, losses.length(g)[:, None] * UP, offset)
+
+
+UP = torch.tensor([0.0, 0.6, 0.8])
+"""The measured normal."""
+
+
+def at_point_error(residual: Callable[[Tensor, Tensor, Tensor], Tensor]) -> Errors:
+    """Of the residual and of its derivative by the gradient at the point, in shares of 1 + |g|.
+
+    The derivative, g / |g| n . (p - q), is 0 where g is; where |g|^2 is denormal, only its size is asked.
+    """
+    distance, g, p_minus_q = taylor_cases()
+    length = g.double().norm(dim=-1)
+    along = (p_minus_q.double() * UP.double()).sum(dim=-1)
+    exact = distance.double() + length * along
+    exact_by_g = F.normalize(g.double(), dim=-1, eps=1e-60) * along[:, None]
+    value, by_g = residual(distance, g, p_minus_q), gradient(lambda x: residual(distance, x, p_minus_q), g)
+    errors = {}
+    for name, least, below in (("|g| = 0", 0, 1e-46), ("faint", 1e-46, 1e-18), ("|g| >= 1e-18", 1e-18, 1e9)):
+        here = (length >= least) & (length < below)
+        errors[name] = largest(value[here], exact[here], 1 + length[here])
+        if name == "faint":
+            too_steep = by_g[here].norm(dim=-1) - 2 * along[here].abs()
+            size = float(too_steep.clamp(min=0).max())
+            errors[name] = max(errors[name], size, largest(by_g[here], by_g[here]))
+        else:
+            errors[name] = max(errors[name], largest(by_g[here], exact_by_g[here]))
     return errors
 
 
@@ -440,6 +509,14 @@ SWEEPS = (
         tolerance=1e-2,
     ),
     Sweep(
+        what="their gradient by differences over a cell, on and beside nodes and the sides, in 1 / step",
+        usual_formula="over twice the step, also where a tap is moved to the side",
+        usual=lambda: hash_difference_error(over_twice=True),
+        ours=lambda: hash_difference_error(over_twice=False),
+        tolerance=2e-5,
+        usual_holds=("within",),
+    ),
+    Sweep(
         what="derivative of the eikonal loss, |g| from 0 to 1e4, in shares of 1 + |g|",
         usual_formula="(|g| - 1)^2",
         usual=lambda: eikonal_slope_error(plain_eikonal),
@@ -453,6 +530,14 @@ SWEEPS = (
         ours=lambda: taylor_error(losses.taylor_at_query),
         tolerance=1e-6,
         usual_holds=("|g| >= 1e-10",),
+    ),
+    Sweep(
+        what="Taylor residual at the point, f - |g| n . (q - p), and its derivative, |g| from 0 to 1e4",
+        usual_formula="|g| as the root of the sum of squares",
+        usual=lambda: at_point_error(at_point_by_root),
+        ours=lambda: at_point_error(at_point),
+        tolerance=1e-6,
+        usual_holds=("|g| >= 1e-18",),
     ),
     Sweep(
         what="Neural-Pull's residual and its derivative, |g| from 0 to 1e4",

@@ -1,7 +1,7 @@
 """Very long and very short lenses, and scenes of any size anywhere: the result is the same up to scale."""
 
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 
@@ -20,16 +20,25 @@ from backend.maths.geometry import (
     project,
     warp_pixels,
 )
-from backend.maths.nearest import nearest_tree
 from backend.maths.rays import first_crossing
 from backend.mesh_files import write_glb
-from backend.scene import Camera, Region, SolvedCameras, StereoResult, no_progress, transform_points
+from backend.scene import (
+    Camera,
+    Region,
+    SolvedCameras,
+    StereoResult,
+    SurfaceMesh,
+    View,
+    no_progress,
+    transform_points,
+)
 from backend.stages.mesh import MeshConfig, extract_mesh
 from backend.stages.region import RegionConfig, find_region
 from backend.stages.stereo import match_views
 from backend.stages.stereo_config import StereoConfig
 from backend.stages.surface import Surface
 from backend.stages.train import TrainConfig, fit_surface
+from tests.stability.surfaces import from_surface
 from tests.synthetic_scene import (
     CENTRE,
     SIZE,
@@ -38,6 +47,7 @@ from tests.synthetic_scene import (
     diagonal,
     photographed,
     surface_distance,
+    surface_points,
     true_region,
 )
 
@@ -109,11 +119,46 @@ def moved(scene: Scene, scale: float, shift: np.ndarray) -> SolvedCameras:
 
 
 @cache
-def small_scene() -> Scene:
-    return photographed(arc_cameras(3, 40, 80))
+def small_scene(masks: bool = True) -> Scene:
+    scene = photographed(arc_cameras(3, 40, 80), wall=not masks)
+    return scene if masks else scene.without_masks()
 
 
-def fitted(solved: SolvedCameras) -> tuple[Region, StereoResult, Surface]:
+def sparse_points() -> np.ndarray:
+    """Of the body, as triangulated ones; without masks they say where it is."""
+    directions = np.random.default_rng(0).normal(size=(200, 3))
+    return surface_points(directions / np.linalg.norm(directions, axis=1, keepdims=True))
+
+
+@dataclass(frozen=True, kw_only=True)
+class World:
+    """The small scene somewhere, at some size, and what becomes of it there."""
+
+    scale: float
+    offset: np.ndarray
+    views: tuple[View, ...]
+    region: Region
+    stereo: StereoResult
+    surface: Surface
+
+    def mesh(self, max_faces: int = 1_000_000) -> SurfaceMesh:
+        """All of it, or simplified."""
+        config = MeshConfig(max_faces=max_faces)
+        return extract_mesh(self.views, self.region, self.stereo, self.surface, config, progress=no_progress)
+
+    def here(self, points: np.ndarray) -> np.ndarray:
+        """Points of this world in that of the small scene."""
+        return np.asarray((points - self.offset) / self.scale)
+
+
+@cache
+def fitted(scale: float = 1.0, shift: float = 0.0, masks: bool = True) -> World:
+    """Without masks the region is that of triangulated points."""
+    offset, sparse = np.array([shift, -shift, shift]), sparse_points()
+    solved = moved(small_scene(masks), scale, offset)
+    if not masks:
+        seen = np.ones((len(sparse), len(solved.views)), bool)
+        solved = replace(solved, sparse_positions=scale * sparse + offset, sparse_visibility=seen)
     region = find_region(solved, RegionConfig(), progress=no_progress)
     stereo = match_views(solved.views, region, QUICK_STEREO, device=CPU, progress=no_progress)
     config = TrainConfig(levels=(32,), rounds=(4,), steps=(0,))
@@ -126,66 +171,65 @@ def fitted(solved: SolvedCameras) -> tuple[Region, StereoResult, Surface]:
         generator=torch.Generator().manual_seed(0),
         progress=no_progress,
     )
-    return region, stereo, surface
+    return World(
+        scale=scale, offset=offset, views=solved.views, region=region, stereo=stereo, surface=surface
+    )
 
 
-@cache
-def fitted_here() -> tuple[Region, StereoResult, Surface]:
-    return fitted(moved(small_scene(), 1.0, np.zeros(3)))
-
-
+MASKS = pytest.mark.parametrize("masks", [True, False], ids=["masks", "no masks"])
 WORLDS = pytest.mark.parametrize(("scale", "shift"), [(1e-4, 0.0), (1e5, 0.0), (1.0, 1e6)], ids=str)
 
 
 @pytest.mark.slow
+@MASKS
 @WORLDS
-def test_the_result_is_the_same_in_any_world(scale: float, shift: float) -> None:
+def test_the_result_is_the_same_in_any_world(scale: float, shift: float, masks: bool) -> None:
     """Region, depths, field and mesh up to the similarity, to 1e-4 of the subject's size; simplified as well.
 
     A point that the last digit moves into the next cube of merged ones moves the nodes around it by up to
     1e-4 of the cube; so points come to the field's frame by numbers in which the world's origin has no part.
     """
-    offset = np.array([shift, -shift, shift])
-    solved = moved(small_scene(), scale, offset)
-    region, stereo, surface = fitted(solved)
-    here = fitted_here()
-    assert region.radius_world == pytest.approx(scale * here[0].radius_world, rel=1e-9)
-    apart = (region.centre_world - offset) / scale - here[0].centre_world
-    assert np.abs(apart).max() < 1e-9 * here[0].radius_world
-    assert len(stereo.points.positions) == len(here[1].points.positions)
-    np.testing.assert_allclose(stereo.points.positions, here[1].points.positions, atol=1e-4)
-    for one, other in zip(stereo.depth_maps, here[1].depth_maps, strict=True):
+    there, here = fitted(scale, shift, masks), fitted(masks=masks)
+    (found,) = here.region.decisions
+    assert found.choice == ("the masked subject" if masks else "where the photographs overlap")
+    assert there.region.radius_world == pytest.approx(scale * here.region.radius_world, rel=1e-9)
+    apart = there.here(there.region.centre_world) - here.region.centre_world
+    assert np.abs(apart).max() < 1e-9 * here.region.radius_world
+    positions = here.stereo.points.positions
+    assert len(there.stereo.points.positions) == len(positions)
+    np.testing.assert_allclose(there.stereo.points.positions, positions, atol=1e-4)
+    for one, other in zip(there.stereo.depth_maps, here.stereo.depth_maps, strict=True):
         np.testing.assert_allclose(one.depth, other.depth, rtol=1e-4)
-    field_apart = np.abs(surface.distance - here[2].distance)
+    field_apart = np.abs(there.surface.distance - here.surface.distance)
     assert field_apart.max() < 1e-4 * 2, "the cube is 2 wide"
     assert field_apart.mean() < 1e-6
-    config = MeshConfig(max_faces=1_000_000)
-    mesh = extract_mesh(solved.views, region, stereo, surface, config, progress=no_progress)
-    other = extract_mesh(small_scene().views, *here, config, progress=no_progress)
-    np.testing.assert_array_equal(mesh.faces, other.faces)
-    size = np.ptp(other.vertices, axis=0).max()
-    assert np.abs((mesh.vertices - offset) / scale - other.vertices).max() < 1e-4 * size
-    np.testing.assert_allclose(mesh.support, other.support, atol=1e-3)
+    mesh, known = there.mesh(), here.mesh()
+    np.testing.assert_array_equal(mesh.faces, known.faces)
+    size = np.ptp(known.vertices, axis=0).max()
+    assert np.abs(there.here(mesh.vertices) - known.vertices).max() < 1e-4 * size
+    np.testing.assert_allclose(mesh.support, known.support, atol=1e-3)
     # which edges are joined may hang on the last digit; the surface may not
-    fewer = MeshConfig(max_faces=2000)
-    mesh = extract_mesh(solved.views, region, stereo, surface, fewer, progress=no_progress)
-    other = extract_mesh(small_scene().views, *here, fewer, progress=no_progress)
-    assert len(other.faces) <= 2000
-    there = (mesh.vertices - offset) / scale
-    apart = np.concatenate(
-        [from_surface(there, other.vertices, other.faces), from_surface(other.vertices, there, mesh.faces)]
+    mesh, known = there.mesh(2000), here.mesh(2000)
+    assert len(known.faces) <= 2000
+    vertices = there.here(mesh.vertices)
+    one_way = from_surface(vertices, known.vertices, known.faces)
+    other_way = from_surface(known.vertices, vertices, mesh.faces)
+    assert max(one_way.max(), other_way.max()) < 1e-4 * size
+
+
+@pytest.mark.slow
+@MASKS
+@pytest.mark.parametrize(
+    ("scale", "shift"),
+    [(1e-4, 0.0), (1e5, 0.0), (1.0, 1e6)],
+    ids=str,
+)
+def test_colours_are_the_same_in_any_world(scale: float, shift: float, masks: bool) -> None:
+    """Of each vertex, also of those that no photograph sees, to one step of 255."""
+    there, here = (
+        world.mesh().colours_srgb.astype(int) for world in (fitted(scale, shift, masks), fitted(masks=masks))
     )
-    assert apart.max() < 1e-3 * size
-    assert apart.mean() < 1e-4 * size
-
-
-def from_surface(points: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Distance of each point from the nearest triangle; those whose middles are nearest are asked."""
-    triangles = vertices[faces]
-    _, near = nearest_tree(triangles.mean(axis=1)).query(points, k=32)
-    repeated = np.repeat(points, 32, axis=0)
-    closest = trimesh.triangles.closest_point(triangles[near.ravel()], repeated)
-    return np.asarray(np.linalg.norm(closest - repeated, axis=1).reshape(-1, 32).min(axis=1))
+    assert np.abs(there - here).max() <= 1
 
 
 def test_distances_from_a_surface_are_those_from_its_triangles() -> None:
@@ -199,8 +243,7 @@ def test_distances_from_a_surface_are_those_from_its_triangles() -> None:
 def test_a_mesh_file_in_single_precision_keeps_its_digits(scale: float, shift: float, tmp_path: Path) -> None:
     """glTF knows no doubles but in the transform of a node."""
     offset = np.array([shift, -shift, shift])
-    views = small_scene().views
-    mesh = extract_mesh(views, *fitted_here(), MeshConfig(), progress=no_progress)
+    mesh = fitted().mesh(MeshConfig().max_faces)
     mesh = replace(mesh, vertices=scale * mesh.vertices + offset)
     size = np.ptp(mesh.vertices, axis=0).max()
     usual = np.abs(mesh.vertices.astype(np.float32) - mesh.vertices).max()

@@ -124,15 +124,16 @@ def fog(alpha: Alpha) -> float:
     return lost
 
 
-def inside_error(alpha: Alpha) -> float:
+def inside_error(alpha: Alpha) -> dict[str, float]:
     """Of the opacity of intervals deep inside, entered (opaque at speed) or left (clear)."""
-    worst = 0.0
-    for distance in (far_behind(1024), from_inside(1024)):
-        for s in (1e2, 1e3, 1e4):
-            exact = -torch.expm1(log_transmittance(distance.double(), s))
-            # float32 holds the logit to its last digit, and the opacity no better
-            worst = max(worst, largest(alpha(distance, s), exact, 1 + s * distance.abs().max().double()))
-    return worst
+
+    def error(distance: Tensor, s: float) -> float:
+        exact = -torch.expm1(log_transmittance(distance.double(), s))
+        # float32 holds the logit to its last digit, and the opacity no better
+        return largest(alpha(distance, s), exact, 1 + s * distance.abs().max().double())
+
+    cases = (far_behind(1024), from_inside(1024))
+    return {f"sharpness {s:g}": max(error(distance, s) for distance in cases) for s in SHARPNESS}
 
 
 def our_alpha(distance: Tensor, sharpness: float) -> Tensor:
@@ -231,7 +232,7 @@ SWEEPS = (
         tolerance=1e-6,
     ),
     Sweep(
-        what="opacity of intervals far inside, relative to 1 + sharpness times depth",
+        what="opacity of intervals far inside, sharpness 1 to 1e5, relative to 1 + sharpness times depth",
         usual_formula="as published, with epsilons",
         usual=lambda: inside_error(published_alpha),
         ours=lambda: inside_error(our_alpha),

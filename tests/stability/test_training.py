@@ -3,10 +3,12 @@
 import math
 import re
 import time
+from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
 from itertools import count
 from types import ModuleType
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,13 +18,18 @@ from torch import Tensor
 
 from backend.errors import ErrorCode, ReconstructionError
 from backend.maths.grid import interpolate, locate
+from backend.point_methods import PointMethod
 from backend.scene import Decision, StereoResult, View, no_progress, transform_points
 from backend.stages import field_surface, neus_fit, radiance_fit
 from backend.stages.deadline import deadline_after
-from backend.stages.measurements import carried, measurements
-from backend.stages.networks import HashConfig, NetworkConfig
+from backend.stages.measurements import Measurements, carried, measurements
+from backend.stages.networks import HashConfig, NetworkConfig, NeuralSurface
 from backend.stages.neus_fit import NeusConfig, fit_neus
-from backend.stages.neus_losses import Sampling, Weights
+from backend.stages.neus_losses import MeasuredPoints, Sampling, Weights
+from backend.stages.point_cloud import PointCloud, clean_cloud
+from backend.stages.point_fit import PointFitConfig, fit_points
+from backend.stages.point_network import METHODS
+from backend.stages.point_network import NetworkConfig as PointNetworkConfig
 from backend.stages.radiance_field import RadianceShape
 from backend.stages.radiance_fit import RadianceConfig, fit_radiance
 from backend.stages.render_fit import Refined, RenderConfig, refine
@@ -184,6 +191,39 @@ def test_no_seed_of_a_network_leads_to_what_is_not_a_number(preset: str, seeds: 
         assert "not taken" not in told
 
 
+TINY_POINT_NETWORK = PointNetworkConfig(width=16, layers=2, steps=30, batch=100, warm_up=5)
+
+
+@cache
+def few_points() -> PointCloud:
+    """Three hundred on a sphere, a hundredth of its radius off."""
+    chance = np.random.default_rng(0)
+    directions = chance.normal(size=(300, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    return clean_cloud(directions + 0.01 * chance.normal(size=(300, 3)), None)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("method", "seeds"),
+    [(PointMethod.LINEAR, range(5)), *((method, range(100)) for method in sorted(METHODS))],
+)
+def test_no_seed_of_points_alone_leads_to_what_is_not_a_number(method: PointMethod, seeds: range) -> None:
+    """No step is taken back, and there is a surface around the middle, another for each seed."""
+    config = PointFitConfig(method=method, nodes=16, sides=TINY_POINT_NETWORK, network=TINY_POINT_NETWORK)
+    middles = set()
+    for seed in seeds:
+        chance = torch.Generator().manual_seed(seed)
+        surface = fit_points(few_points(), config, device=CPU, generator=chance, progress=no_progress)
+        assert np.isfinite(surface.distance).all()
+        middle = float(surface.distance[7:9, 7:9, 7:9].mean())
+        assert middle < 0 < surface.distance.max()
+        middles.add(middle)
+        told = [decision for decision in surface.decisions if decision.choice == "30 steps"]
+        assert [decision.because for decision in told] == ["the method's setting"]
+    assert len(middles) == len(seeds)
+
+
 def test_a_few_pixels_that_are_no_numbers_cost_a_few_steps() -> None:
     one_pixel = spoiled(slice(20, 21), slice(30, 31))
     with_it, without = rendered(one_pixel, 40), rendered(scene().views, 40)
@@ -306,6 +346,60 @@ def test_a_pixel_that_is_no_number_costs_two_steps(
 def test_networks_that_learn_nothing_but_what_is_no_number_are_an_error(module: ModuleType) -> None:
     with pytest.raises(ReconstructionError, match="Nothing could be learned from the photographs") as raised:
         learned(module, spoiled(slice(None), slice(None)))
+    assert raised.value.code == ErrorCode.NO_SURFACE
+
+
+# SparseCraft's points
+
+
+def sparse_crafted() -> Surface:
+    """Forty steps with points."""
+    config = TINY_NETWORKS["sparsecraft"]
+    assert isinstance(config, NeusConfig)
+    given = (scene().views, true_region(), stereo(), replace(config, steps=40))
+    chance = torch.Generator().manual_seed(0)
+    return fit_neus(*given, device=CPU, generator=chance, progress=no_progress)
+
+
+@pytest.mark.parametrize("name", ["loss", "colours", "normals"])
+def test_points_that_are_no_numbers_in_one_step_are_told_and_the_others_count(
+    name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In the twentieth step, every second of them, or the loss; that, taken plainly, leaves nothing."""
+    loss, calls = neus_fit.point_loss, count(1)
+
+    def planted(surface: NeuralSurface, measured: MeasuredPoints, *others: Any) -> Tensor:
+        wrong = next(calls) == 20
+        if wrong and name != "loss":
+            values = getattr(measured, name).clone()
+            values[::2] = math.nan
+            measured = replace(measured, **{name: values})
+        found = loss(surface, measured, *others)
+        return found * math.nan if wrong and name == "loss" else found
+
+    assert taken_back(sparse_crafted()) == 0
+    monkeypatch.setattr(neus_fit, "point_loss", planted)
+    surface = sparse_crafted()
+    assert np.isfinite(surface.distance).all()
+    assert taken_back(surface) == 1
+    assert next(calls) == 41
+    if name == "loss":
+        calls = count(1)
+        monkeypatch.setattr(neus_fit, "SafeSteps", PlainSteps)
+        with pytest.raises(ReconstructionError):
+            sparse_crafted()
+
+
+def test_points_none_of_which_is_a_number_are_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    measured = neus_fit.measured_points
+
+    def planted(given: Measurements) -> MeasuredPoints:
+        points = measured(given)
+        return replace(points, colours=torch.full_like(points.colours, math.nan))
+
+    monkeypatch.setattr(neus_fit, "measured_points", planted)
+    with pytest.raises(ReconstructionError, match="Nothing could be learned from the photographs") as raised:
+        sparse_crafted()
     assert raised.value.code == ErrorCode.NO_SURFACE
 
 

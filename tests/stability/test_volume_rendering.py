@@ -10,11 +10,12 @@ import torch
 from torch import Tensor
 
 from backend.maths.losses import silhouette
-from backend.maths.radiance import composite, log_pass_of_density
+from backend.maths.radiance import composite, log_pass_of_density, mean_colour
 from backend.maths.volume import blending_weights, log_transparency
 from tests.stability.sweep import Errors, Sweep, check, gradient, largest
 
 SAMPLES = (1, 2, 3, 16, 64, 256, 1024, 4096)
+LAST_EDGES = (1e10, 1e30)
 Weights = Callable[[Tensor], Tensor]
 """From optical depths (density times length) of intervals to the weights of their colours."""
 
@@ -84,7 +85,10 @@ def thin_optical_depths() -> Cases:
 
 
 def densities_and_edges() -> dict[str, list[tuple[Tensor, Tensor]]]:
-    """Densities of 1e-8 to 1e8 between edges from 0.5 to 3.5, an even or an uneven length apart, or none."""
+    """Densities of 1e-8 to 1e8 between edges from 0.5 to 3.5, an even or an uneven length apart, or none.
+
+    Also with a last interval to 1e10 and 1e30, as where a ray has no end.
+    """
     generator = torch.Generator().manual_seed(3)
     cases: dict[str, list[tuple[Tensor, Tensor]]] = {}
     for count in (1, 64, 4096):
@@ -103,6 +107,12 @@ def densities_and_edges() -> dict[str, list[tuple[Tensor, Tensor]]]:
             ("mixed, with lengths of 0", density, drawn),
         ):
             cases.setdefault(name, []).append((values, edges))
+        for last in LAST_EDGES if count > 1 else ():
+            endless = [
+                torch.cat([edges[:, :-1], torch.full((8, 1), last)], dim=-1) for edges in (even, drawn)
+            ]
+            given = [(values, endless[0]) for values in (thin, opaque_amid)]
+            cases.setdefault(f"last edge at {last:g}", []).extend([*given, (density, endless[1])])
     return cases
 
 
@@ -205,12 +215,12 @@ def relative(found: Tensor, exact: Tensor, digits: Tensor) -> float:
 
 
 def density_and_edge_error(pixel: Pixel) -> Errors:
-    """Of the gradients by densities and edges, in shares of the longest interval and the largest density."""
+    """Of the gradients by densities and edges, in shares of the interval and the largest density."""
 
     def error(ray: Ray) -> float:
         by_density, by_edge, *_ = slopes(pixel, ray, torch.float32)
         exact_by_density, exact_by_edge, *_ = slopes(our_pixel, ray, torch.float64)
-        length = float(ray.edges.diff(dim=-1).amax().clamp(min=1e-4))
+        length = ray.edges.double().diff(dim=-1).clamp(min=1e-4)
         density = ray.density.double().amax(dim=-1, keepdim=True).clamp(min=1e-8)
         return max(largest(by_density, exact_by_density, length), largest(by_edge, exact_by_edge, density))
 
@@ -233,6 +243,45 @@ def colour_and_background_error(pixel: Pixel) -> Errors:
         )
 
     return {name: max(map(error, of_name)) for name, of_name in rays().items()}
+
+
+# a pixel of what is opaque alone
+
+
+def our_mean_colour(depth: Tensor, colour: Tensor) -> Tensor:
+    """As the default has it: what is behind has no part, and a ray of little opacity is darker."""
+    return mean_colour(-depth, colour)
+
+
+def plain_mean_colour(depth: Tensor, colour: Tensor) -> Tensor:
+    """Over the opacity as it is."""
+    weights = by_running_product(depth)
+    return torch.einsum("ri,ric->rc", weights, colour) / weights.sum(dim=-1)[:, None]
+
+
+def mean_colour_error(mean_colour: Callable[[Tensor, Tensor], Tensor]) -> Errors:
+    """Of the value and, in shares of its largest size, of the gradient by optical depths.
+
+    Against the same in float64, with 8 intervals to a ray as the default has them.
+    """
+    cases = {
+        "empty": [0.0],
+        "faint": [1e-12, 1e-8, 1e-6, 1e-4],
+        "some": [1e-2, 0.3, 1.0, 5.0],
+        "opaque": [1e8],
+    }
+    share = torch.rand((16, 8), generator=torch.Generator().manual_seed(6))
+    share = share / share.sum(dim=-1, keepdim=True)
+    colour = torch.rand((16, 8, 3), generator=torch.Generator().manual_seed(7))
+
+    def error(depth: Tensor) -> float:
+        found = gradient(lambda x: mean_colour(x, colour), depth)
+        exact = gradient(lambda x: mean_colour(x, colour.double()), depth.double())
+        size = exact.abs().max().clamp(min=1.0)
+        value = largest(mean_colour(depth, colour), mean_colour(depth.double(), colour.double()))
+        return max(value, largest(found, exact, size))
+
+    return {name: max(error(depth * share) for depth in depths) for name, depths in cases.items()}
 
 
 # masks
@@ -299,7 +348,7 @@ SWEEPS = (
         usual_holds=("empty",),
     ),
     Sweep(
-        what="gradient by densities and ends of intervals, in shares of length and largest density",
+        what="gradient by densities and ends of intervals, in shares of its length and largest density",
         usual_formula="running sum of log(1 - alpha)",
         usual=lambda: density_and_edge_error(usual_pixel(by_logs_of_alpha)),
         ours=lambda: density_and_edge_error(our_pixel),
@@ -313,6 +362,14 @@ SWEEPS = (
         ours=lambda: colour_and_background_error(our_pixel),
         tolerance=1e-6,
         usual_holds=("empty", "opaque first"),
+    ),
+    Sweep(
+        what="mean colour of what is opaque and its gradient by optical depths of 0 to 1e8",
+        usual_formula="running product of 1 - alpha + 1e-10, over the opacity as it is",
+        usual=lambda: mean_colour_error(plain_mean_colour),
+        ours=lambda: mean_colour_error(our_mean_colour),
+        tolerance=1e-6,
+        usual_holds=("opaque",),
     ),
     Sweep(
         what="cross-entropy of opacity and mask and its derivative, optical depth 0 to 1e8",
