@@ -43,10 +43,10 @@ def arc_pose(angle_deg: float) -> np.ndarray:
     return look_at_origin(np.array([3 * math.sin(angle), 0.4 * math.sin(2 * angle), -3 * math.cos(angle)]))
 
 
-def render(camera_from_world: np.ndarray, slope: float = SLOPE) -> np.ndarray:
+def render(camera_from_world: np.ndarray, slope: float = SLOPE, focal_px: float = FOCAL_PX) -> np.ndarray:
     """The ridge as seen through a pinhole with its principal point in the middle."""
     columns, rows = np.meshgrid(np.arange(WIDTH) + 0.5 - WIDTH / 2, np.arange(HEIGHT) + 0.5 - HEIGHT / 2)
-    rays = np.stack([columns / FOCAL_PX, rows / FOCAL_PX, np.ones_like(rows)], axis=-1)
+    rays = np.stack([columns / focal_px, rows / focal_px, np.ones_like(rows)], axis=-1)
     rays = rays @ camera_from_world[:3, :3]
     origin = -camera_from_world[:3, :3].T @ camera_from_world[:3, 3]
     nearest = np.full(rows.shape, np.inf)

@@ -84,6 +84,9 @@ _ATTEMPTS = (
 )
 """Tried in this order until all photographs are placed and confirmed, the guided ones until enough are."""
 
+_LONGEST_FOCAL_WIDTHS = 1000.0
+"""COLMAP's own bound of ten refuses what a long lens, or a crop, tells in EXIF."""
+
 _DRAWS = 4
 """Of chance, for each sensitive attempt. The walnut's three photographs come out right or 55 degrees wrong by
 what the first pair happens to agree on, but then with a quarter of the points that three confirm."""
@@ -364,6 +367,7 @@ def _mapped(
     options = pycolmap.IncrementalPipelineOptions()
     options.min_model_size = 2
     options.extract_colors = False
+    options.max_focal_length_ratio = _LONGEST_FOCAL_WIDTHS
     # One thread: sums in another order would be another result.
     options.num_threads = options.mapper.num_threads = 1
     options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = seed

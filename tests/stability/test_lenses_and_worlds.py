@@ -11,7 +11,9 @@ import pytest
 import torch
 import torch.nn.functional as F
 import trimesh
+from scipy.spatial.transform import Rotation
 
+from backend.errors import ErrorCode, ReconstructionError
 from backend.maths.geometry import (
     Pinhole,
     epipolar_map,
@@ -24,6 +26,7 @@ from backend.maths.rays import first_crossing
 from backend.mesh_files import write_glb
 from backend.scene import (
     Camera,
+    Photo,
     Region,
     SolvedCameras,
     StereoResult,
@@ -32,12 +35,15 @@ from backend.scene import (
     no_progress,
     transform_points,
 )
+from backend.stages import structure_from_motion
+from backend.stages.cameras import CamerasConfig, solve_cameras
 from backend.stages.mesh import MeshConfig, extract_mesh
 from backend.stages.region import RegionConfig, find_region
 from backend.stages.stereo import match_views
 from backend.stages.stereo_config import StereoConfig
 from backend.stages.surface import Surface
 from backend.stages.train import TrainConfig, fit_surface
+from tests.ridge_photos import FOCAL_PX, WIDTH, arc_pose, make_photo, render
 from tests.stability.surfaces import from_surface
 from tests.synthetic_scene import (
     CENTRE,
@@ -89,6 +95,47 @@ def test_depth_through_very_short_and_very_long_lenses(
     points = transform_points(true_region().world_from_object, result.points.positions.astype(np.float64))
     assert len(points) > num_points
     assert np.median(np.abs(surface_distance(points))) < 0.0008 * diagonal()
+
+
+def ridge_from(focal_widths: float) -> tuple[list[Photo], list[np.ndarray]]:
+    """Three photographs of the ridge, as large in each: a long lens from far away; and their cameras."""
+    focal_px = focal_widths * WIDTH
+    poses = []
+    for angle_deg in (-18.0, 0.0, 15.0):
+        pose = arc_pose(angle_deg)
+        pose[:3, 3] *= focal_px / FOCAL_PX
+        poses.append(pose)
+    images = (render(pose, focal_px=focal_px) for pose in poses)
+    return [make_photo(f"{i}.png", image, focal_px) for i, image in enumerate(images)], poses
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("focal_widths", "most_deg"), [(0.34, 2.0), (7.0, 0.1), (10.5, 0.1), (105.0, 0.1)])
+def test_cameras_of_very_short_and_very_long_lenses_that_are_known(
+    focal_widths: float, most_deg: float, tmp_path: Path
+) -> None:
+    photos, poses = ridge_from(focal_widths)
+    solved = solve_cameras(photos, None, CamerasConfig(), workdir=tmp_path, seed=0, progress=no_progress)
+    assert [view.name for view in solved.views] == ["0.png", "1.png", "2.png"]
+    assert solved.views[0].camera.fx_px == pytest.approx(focal_widths * WIDTH, rel=0.03)
+    first = solved.views[0].camera.camera_from_world
+    for view, pose in zip(solved.views[1:], poses[1:], strict=True):
+        ours = view.camera.camera_from_world @ np.linalg.inv(first)
+        true = pose @ np.linalg.inv(poses[0])
+        turn = Rotation.from_matrix(ours[:3, :3].T @ true[:3, :3]).magnitude()
+        assert math.degrees(turn) < most_deg
+
+
+@pytest.mark.slow
+def test_by_the_usual_bound_a_long_lens_has_no_cameras(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """COLMAP takes a focal length of more than ten widths for a mistake."""
+    monkeypatch.setattr(structure_from_motion, "_LONGEST_FOCAL_WIDTHS", 10.0)
+    photos, _ = ridge_from(10.5)
+    with pytest.raises(ReconstructionError) as caught:
+        solve_cameras(photos, None, CamerasConfig(), workdir=tmp_path, seed=0, progress=no_progress)
+    assert caught.value.code is ErrorCode.TOO_FEW_PLACED
 
 
 def test_a_search_to_twice_the_depth_has_no_steps_left_for_a_long_lens() -> None:
