@@ -126,7 +126,7 @@ def test_clouds_that_can_not_be_used(tmp_path: Path) -> None:
         ("", "empty"),
         ("# only a remark\n", "empty"),
         ("1 2\n3 4\n", "2 columns"),
-        ("one two three\n", "can not be read"),
+        ("one two three\n", "cannot be read"),
         ("nan nan nan\n" * 50, "0 different points"),
         ("1 2 3\n" * 50, f"1 different points with finite coordinates; {FEWEST_POINTS}"),
     ):
@@ -138,4 +138,4 @@ def test_clouds_that_can_not_be_used(tmp_path: Path) -> None:
     assert "one plane" in refusal(path)
     broken = tmp_path / "cloud.ply"
     broken.write_bytes(b"ply\nformat ascii 1.0\nelement vertex 5\nproperty float x\nend_header\n")
-    assert "can not be read" in refusal(broken)
+    assert "cannot be read" in refusal(broken)
