@@ -84,6 +84,11 @@ _ATTEMPTS = (
 )
 """Tried in this order until all photographs are placed and confirmed, the guided ones until enough are."""
 
+_OTHER_FOCAL_FACTORS = (0.4, 4.0, 12.0)
+"""Where nothing tells the focal length: begun with that of a usual lens, the mapper takes a very short or
+very long one for such, and turns 30 degrees off for right; but then fewer points are confirmed."""
+_CLEARLY_MORE = 1.05
+
 _LONGEST_FOCAL_WIDTHS = 1000.0
 """COLMAP's own bound of ten refuses what a long lens, or a crop, tells in EXIF."""
 
@@ -302,10 +307,43 @@ def _best_model(
                 if best is None or _merit(model) > _merit(best):
                     best, best_database = model, database
         if not attempt.sensitive:
+            best = _with_another_lens(best, database, folder, workdir, attempt, seed, on_photo)
             best_of_usual = best
     if best is None or not extracted:
         return best, database, ()
     return best, best_database, (_why_fainter(best_of_usual, best, num_photos),)
+
+
+def _with_another_lens(
+    model: pycolmap.Reconstruction | None,
+    database: Path,
+    folder: Path,
+    workdir: Path,
+    attempt: _Attempt,
+    seed: int,
+    on_photo: Callable[[], None],
+) -> pycolmap.Reconstruction | None:
+    """The model, or one begun with another focal length, where that places more or confirms clearly more.
+
+    Where there is no model, or all focal lengths are known, there is nothing to be tried.
+    """
+    with pycolmap.Database.open(database) as opened:
+        unknown = [lens for lens in opened.read_all_cameras() if not lens.has_prior_focal_length]
+    if model is None or not unknown:
+        return model
+    best = model
+    for factor in (*_OTHER_FOCAL_FACTORS, _UNKNOWN_FOCAL_FACTOR):
+        with pycolmap.Database.open(database) as opened:
+            for lens in unknown:
+                lens.focal_length = factor * max(lens.width, lens.height)
+                opened.update_camera(lens)
+        if factor == _UNKNOWN_FOCAL_FACTOR:  # as it was
+            break
+        for other in _mapped(database, folder, workdir, attempt, seed, on_photo):
+            placed, confirmed, _ = _merit(best)
+            if _merit(other) > (placed, int(_CLEARLY_MORE * confirmed), 0):
+                best = other
+    return best
 
 
 def _why_fainter(

@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 
 import numpy as np
@@ -97,7 +97,7 @@ def test_depth_through_very_short_and_very_long_lenses(
     assert np.median(np.abs(surface_distance(points))) < 0.0008 * diagonal()
 
 
-def ridge_from(focal_widths: float) -> tuple[list[Photo], list[np.ndarray]]:
+def ridge_from(focal_widths: float, *, told: bool = True) -> tuple[list[Photo], list[np.ndarray]]:
     """Three photographs of the ridge, as large in each: a long lens from far away; and their cameras."""
     focal_px = focal_widths * WIDTH
     poses = []
@@ -106,7 +106,19 @@ def ridge_from(focal_widths: float) -> tuple[list[Photo], list[np.ndarray]]:
         pose[:3, 3] *= focal_px / FOCAL_PX
         poses.append(pose)
     images = (render(pose, focal_px=focal_px) for pose in poses)
-    return [make_photo(f"{i}.png", image, focal_px) for i, image in enumerate(images)], poses
+    in_exif = focal_px if told else None
+    return [make_photo(f"{i}.png", image, in_exif) for i, image in enumerate(images)], poses
+
+
+def worst_turn_deg(solved: SolvedCameras, poses: list[np.ndarray]) -> float:
+    """Between the first photograph and each other one."""
+    first = solved.views[0].camera.camera_from_world
+    turns = []
+    for view, pose in zip(solved.views[1:], poses[1:], strict=True):
+        ours = view.camera.camera_from_world @ np.linalg.inv(first)
+        true = pose @ np.linalg.inv(poses[0])
+        turns.append(Rotation.from_matrix(ours[:3, :3].T @ true[:3, :3]).magnitude())
+    return math.degrees(max(turns))
 
 
 @pytest.mark.slow
@@ -118,12 +130,21 @@ def test_cameras_of_very_short_and_very_long_lenses_that_are_known(
     solved = solve_cameras(photos, None, CamerasConfig(), workdir=tmp_path, seed=0, progress=no_progress)
     assert [view.name for view in solved.views] == ["0.png", "1.png", "2.png"]
     assert solved.views[0].camera.fx_px == pytest.approx(focal_widths * WIDTH, rel=0.03)
-    first = solved.views[0].camera.camera_from_world
-    for view, pose in zip(solved.views[1:], poses[1:], strict=True):
-        ours = view.camera.camera_from_world @ np.linalg.inv(first)
-        true = pose @ np.linalg.inv(poses[0])
-        turn = Rotation.from_matrix(ours[:3, :3].T @ true[:3, :3]).magnitude()
-        assert math.degrees(turn) < most_deg
+    assert worst_turn_deg(solved, poses) < most_deg
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("focal_widths", [0.34, 1.05, 10.5, 105.0])
+def test_cameras_of_very_short_and_very_long_lenses_that_nothing_tells(
+    focal_widths: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Begun with a usual lens alone the mapper takes the extremes for one, and turns by 30 degrees."""
+    photos, poses = ridge_from(focal_widths, told=False)
+    solve = partial(solve_cameras, photos, None, CamerasConfig(), seed=0, progress=no_progress)
+    assert worst_turn_deg(solve(workdir=tmp_path / "ours"), poses) < 1.0
+    monkeypatch.setattr(structure_from_motion, "_OTHER_FOCAL_FACTORS", ())
+    usual_deg = worst_turn_deg(solve(workdir=tmp_path / "usual"), poses)
+    assert (usual_deg > 20) == (focal_widths in (0.34, 105.0))
 
 
 @pytest.mark.slow
