@@ -137,14 +137,15 @@ def _ray_loss(
     towards = directions[:, None].expand_as(middles).reshape(-1, 3)
     colour = field.colour(corners, normal, towards).reshape(*middles.shape)
     rendered = mean_colour(log_pass, colour)
-    opacity = -torch.expm1(log_transparency(log_pass).detach())
+    log_clear = log_transparency(log_pass)
+    opacity = -torch.expm1(log_clear.detach())
     coverage = pixels.coverage[chosen]
     masked = ~coverage.isnan()
     trust = torch.where(masked, coverage, 1.0) * opacity * crossing.hit
     difference = losses.charbonnier(rendered - pixels.colour[chosen], 0.02).mean(dim=-1)
     loss = (trust * difference).mean() + 0.1 * losses.eikonal(gradient)
     if masked.any():
-        loss = loss + 0.1 * losses.silhouette(log_transparency(log_pass)[masked], coverage[masked])
+        loss = loss + 0.1 * losses.silhouette(log_clear[masked], coverage[masked])
     return loss
 
 

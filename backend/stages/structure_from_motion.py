@@ -303,11 +303,12 @@ def _best_model(
                     seed=seed + draw,
                 )
                 matched = wanted
-            for model in _mapped(database, folder, workdir, attempt, seed + draw, on_photo):
+            mapped = partial(_mapped, database, folder, workdir, attempt, seed + draw, on_photo)
+            for model in mapped():
                 if best is None or _merit(model) > _merit(best):
                     best, best_database = model, database
         if not attempt.sensitive:
-            best = _with_another_lens(best, database, folder, workdir, attempt, seed, on_photo)
+            best = _with_another_lens(best, database, mapped)
             best_of_usual = best
     if best is None or not extracted:
         return best, database, ()
@@ -315,13 +316,7 @@ def _best_model(
 
 
 def _with_another_lens(
-    model: pycolmap.Reconstruction | None,
-    database: Path,
-    folder: Path,
-    workdir: Path,
-    attempt: _Attempt,
-    seed: int,
-    on_photo: Callable[[], None],
+    model: pycolmap.Reconstruction | None, database: Path, mapped: Callable[[], list[pycolmap.Reconstruction]]
 ) -> pycolmap.Reconstruction | None:
     """The model, or one begun with another focal length, where that places more or confirms clearly more.
 
@@ -332,18 +327,22 @@ def _with_another_lens(
     if model is None or not unknown:
         return model
     best = model
-    for factor in (*_OTHER_FOCAL_FACTORS, _UNKNOWN_FOCAL_FACTOR):
-        with pycolmap.Database.open(database) as opened:
-            for lens in unknown:
-                lens.focal_length = factor * max(lens.width, lens.height)
-                opened.update_camera(lens)
-        if factor == _UNKNOWN_FOCAL_FACTOR:  # as it was
-            break
-        for other in _mapped(database, folder, workdir, attempt, seed, on_photo):
+    for factor in _OTHER_FOCAL_FACTORS:
+        _begin_with(database, unknown, factor)
+        for other in mapped():
             placed, confirmed, _ = _merit(best)
             if _merit(other) > (placed, int(_CLEARLY_MORE * confirmed), 0):
                 best = other
+    _begin_with(database, unknown, _UNKNOWN_FOCAL_FACTOR)
     return best
+
+
+def _begin_with(database: Path, lenses: Sequence[pycolmap.Camera], factor: float) -> None:
+    """Enter so many times the longer side as these lenses' focal length."""
+    with pycolmap.Database.open(database) as opened:
+        for lens in lenses:
+            lens.focal_length = factor * max(lens.width, lens.height)
+            opened.update_camera(lens)
 
 
 def _why_fainter(
