@@ -9,6 +9,7 @@ from pathlib import Path
 
 from ..backend.wire.client import ROOT, backend_command
 from ..backend.wire.environment import CONSTRAINTS, is_ours, python_in, requirements, sizes_gb
+from ..backend.wire.photographs import first_names
 from ..backend.wire.protocol import Checked
 
 VARIABLE = "FEWVIEW_PYTHON"
@@ -176,9 +177,7 @@ def _fault_text(faults: Sequence[Checked]) -> str:
     first = faults[0]
     if first.name == _PYTHON or len(faults) == 1:
         return f"{first.name}: {first.found}"
-    names = [fault.name for fault in faults]
-    more = f" and {len(names) - 3} more" if len(names) > 3 else ""
-    return f"Missing: {', '.join(names[:3])}{more}"
+    return f"Missing: {first_names([fault.name for fault in faults])}"
 
 
 def _quoted_for_cmd(words: Sequence[str]) -> str:

@@ -11,7 +11,7 @@ from jaxtyping import Float32
 from ..errors import ErrorCode, ReconstructionError
 from ..images import DecodedImage, read_image, resized, same_shape
 from ..scene import Photo, Progress
-from ..wire.photographs import names_of, photographs_in
+from ..wire.photographs import first_names, names_of, photographs_in
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -106,9 +106,8 @@ def match_masks(names: Sequence[str], masks_folder: Path) -> dict[str, Path]:
 
 def without_masks_text(names: Sequence[str]) -> str:
     """What to say of photographs without masks where others have some."""
-    others = f" and {len(names) - 3} more" if len(names) > 3 else ""
     return (
-        f"There is no mask for {', '.join(names[:3])}{others}: their background may stay in the mesh. "
+        f"There is no mask for {first_names(names)}: their background may stay in the mesh. "
         f"Name the mask of {names[0]} {Path(names[0]).stem}.png."
     )
 

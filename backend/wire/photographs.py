@@ -34,10 +34,15 @@ def passed_over_text(names: Sequence[str]) -> str:
     """What to tell the user of pictures that were passed over; empty where there are none."""
     if not names:
         return ""
-    shown = ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
     return (
-        f"Passed over, because only JPEG, PNG, TIFF, WebP and BMP can be read: {shown}. Convert them to JPEG."
+        "Passed over, because only JPEG, PNG, TIFF, WebP and BMP can be read: "
+        f"{first_names(names)}. Convert them to JPEG."
     )
+
+
+def first_names(names: Sequence[str]) -> str:
+    """Three of the names, and how many more there are."""
+    return ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
 
 
 def names_of(paths: Sequence[Path]) -> list[str]:
