@@ -4,15 +4,14 @@ import argparse
 import faulthandler
 import io
 import logging
-import math
 import sys
 from pathlib import Path
 from typing import Any
 
 from . import doctor
 from .commands import install
-from .commands.argument_types import seed
-from .commands.benchmark import add_benchmark, benchmark, positive_seconds
+from .commands.argument_types import finite_number, positive_seconds, seed
+from .commands.benchmark import add_benchmark, benchmark
 from .commands.doctor import doctor_on_wire
 from .commands.fit_points import add_fit_points, fit_points_command
 from .commands.reconstruct import EXIT_FINE, EXIT_USER_ERROR, on_terminal, on_wire
@@ -127,7 +126,7 @@ def _parser() -> argparse.ArgumentParser:
     add(
         "--region",
         nargs=4,
-        type=_number,
+        type=finite_number,
         metavar=("X", "Y", "Z", "RADIUS"),
         help="sphere to reconstruct, in the frame of the cameras; else it is found",
     )
@@ -149,7 +148,9 @@ def _parser() -> argparse.ArgumentParser:
     _add_install(commands.add_parser("install", help="make an environment with everything needed"))
     rehearsal = commands.add_parser("rehearse", help="play a run's messages without running it")
     rehearsal.add_argument("--output", metavar="DIR", type=Path, help="new folder for a toy mesh")
-    rehearsal.add_argument("--seconds", metavar="S", type=_number, default=1.0, help="how long it takes (1)")
+    rehearsal.add_argument(
+        "--seconds", metavar="S", type=finite_number, default=1.0, help="how long it takes (1)"
+    )
     rehearsal.add_argument("--end", choices=ENDS, default="finished")
     add_benchmark(commands.add_parser("benchmark", help="measure speed against error"))
     return parser
@@ -172,13 +173,6 @@ def _add_install(parser: argparse.ArgumentParser) -> None:
     add("--again", action="store_true", help="replace an environment that is ready")
     add("--remove", action="store_true", help="remove the environment instead")
     add("--requirements", metavar="FILE", type=Path, help=argparse.SUPPRESS)
-
-
-def _number(text: str) -> float:
-    number = float(text)
-    if not math.isfinite(number):
-        raise argparse.ArgumentTypeError("must be a finite number")
-    return number
 
 
 if __name__ == "__main__":

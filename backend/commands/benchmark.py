@@ -1,7 +1,6 @@
 """The command that measures speed against error over a suite of cases."""
 
 import argparse
-import math
 import sys
 from collections.abc import Sequence
 from dataclasses import replace
@@ -14,6 +13,7 @@ from ..benchmark.suites import SUITES, Found, Suite, find_cases, with_budget
 from ..errors import ErrorCode, ReconstructionError
 from ..wire.client import backend_command
 from ..wire.protocol import DEVICES, PRESETS
+from .argument_types import count, positive_seconds
 from .cancelling import CancelRequest, watch_signals
 from .reconstruct import settle
 
@@ -36,7 +36,7 @@ def add_benchmark(parser: argparse.ArgumentParser) -> None:
     add("--photos", metavar="DIR", type=Path, help="the sets of real photographs")
     add("--cases", nargs="+", metavar="CASE", help="of the suite, only these")
     add("--presets", nargs="+", choices=PRESETS, default=["fast", "balanced"])
-    add("--seeds", type=_count, metavar="N", default=3, help="how often to run everything (3)")
+    add("--seeds", type=count, metavar="N", default=3, help="how often to run everything (3)")
     add(
         "--budgets",
         nargs="+",
@@ -194,18 +194,3 @@ def _line(run: "Measurement") -> str:
 
 def _say(text: str) -> None:
     sys.stderr.write(text + "\n")
-
-
-def positive_seconds(text: str) -> float:
-    """A budget of the command line; ValueError or ArgumentTypeError where it is none."""
-    seconds = float(text)
-    if not 0 < seconds < math.inf:
-        raise argparse.ArgumentTypeError("must be a positive number")
-    return seconds
-
-
-def _count(text: str) -> int:
-    number = int(text)
-    if number < 1:
-        raise argparse.ArgumentTypeError("must be 1 or more")
-    return number

@@ -16,7 +16,7 @@ from ..mesh_files import SPARSE, MeshFileError, read_sparse
 from ..scene import Camera, Decision, Photo, Unplaced
 from ..wire.photographs import is_named
 from .lenses import PlacedPhoto, Placement, rigid_matrix, sparse_points, undistorted_view
-from .nerfstudio import Estimate, camera_from_world, estimate_or_none, frame_lens, read_frames
+from .nerfstudio import Estimate, estimate_or_none, frame_lens, read_frames, world_from_camera
 
 _ROTATION_TOLERANCE = 5e-3
 """Poses are often written with few digits; nearer than this they are made exact."""
@@ -109,7 +109,10 @@ def match_by_name(photo_paths: Sequence[str], camera_paths: Sequence[str]) -> di
 
 
 def checked_pose(b_from_a: Float64[np.ndarray, "4 4"], photo_name: str) -> Float64[np.ndarray, "4 4"]:
-    """The pose with its rotation made exact. Raises ReconstructionError where it is none."""
+    """The pose with its rotation made exact and its translation as it is.
+
+    Raises ReconstructionError(CAMERAS_UNUSABLE) where it is none.
+    """
     if not np.isfinite(b_from_a).all():
         raise _unusable(f"The camera of {photo_name} has numbers that are not finite.")
     rotation = b_from_a[:3, :3]
@@ -150,7 +153,9 @@ def _from_transforms(photos: Sequence[Photo], path: Path) -> Placement:
     for index, number in sorted(matched.items()):
         photo, frame = photos[index], frames[number]
         lens = frame_lens(frame, photo)
-        placed.append(_placed(index, photo, lens, camera_from_world(frame, photo.name)))
+        # exact before it is inverted: far from the origin the position keeps its digits, not the rotation's
+        pose = checked_pose(world_from_camera(frame, photo.name), photo.name)
+        placed.append(_placed(index, photo, lens, np.linalg.inv(pose)))
     columns = [number for _, number in sorted(matched.items())]
     positions, visibility = np.zeros((0, 3)), np.zeros((0, len(placed)), bool)
     if estimate is not None:
@@ -207,7 +212,8 @@ def _from_model(photos: Sequence[Photo], folder: Path) -> Placement:
     for index, number in sorted(matched.items()):
         image = model.images[image_ids[number]]
         lens = model.cameras[image.camera_id]
-        placed.append(_placed(index, photos[index], lens, rigid_matrix(image.cam_from_world())))
+        pose = checked_pose(rigid_matrix(image.cam_from_world()), photos[index].name)
+        placed.append(_placed(index, photos[index], lens, pose))
         ids.append(image_ids[number])
     positions, visibility = sparse_points(model, ids)
     return Placement(
@@ -271,7 +277,7 @@ def _placed(index: int, photo: Photo, lens: pycolmap.Camera, pose: Float64[np.nd
         raise _unusable(text, "Give photographs and cameras of one direction each.")
     if not np.isfinite(lens.params).all() or min(lens.focal_length_x, lens.focal_length_y) <= 0:
         raise _unusable(f"The focal length or distortion of {photo.name} is not finite and positive.")
-    return PlacedPhoto(index=index, lens=lens, camera_from_world=checked_pose(pose, photo.name))
+    return PlacedPhoto(index=index, lens=lens, camera_from_world=pose)
 
 
 def _unusable(text: str, remedy: str = _CHECK) -> ReconstructionError:

@@ -71,8 +71,8 @@ def read_frames(path: Path) -> list[Frame]:
     return frames
 
 
-def camera_from_world(frame: Frame, photo_name: str) -> Float64[np.ndarray, "4 4"]:
-    """The frame's pose in our camera axes, as written: not checked to be a rotation."""
+def world_from_camera(frame: Frame, photo_name: str) -> Float64[np.ndarray, "4 4"]:
+    """The frame's pose for our camera axes, as written: not checked to be a rotation with a position."""
     try:
         matrix = np.array(frame["transform_matrix"], np.float64)
     except (ValueError, TypeError) as error:
@@ -81,10 +81,8 @@ def camera_from_world(frame: Frame, photo_name: str) -> Float64[np.ndarray, "4 4
         matrix = np.vstack([matrix, [0.0, 0.0, 0.0, 1.0]])
     if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
         raise _unusable(f"The camera matrix of {photo_name} is not 4x4 finite numbers.")
-    if abs(np.linalg.det(matrix)) < 1e-12:
-        raise _unusable(f"The camera matrix of {photo_name} is singular.")
-    inverse: Float64[np.ndarray, "4 4"] = OPENCV_FROM_OPENGL @ np.linalg.inv(matrix)
-    return inverse
+    pose: Float64[np.ndarray, "4 4"] = matrix @ OPENCV_FROM_OPENGL
+    return pose
 
 
 def frame_lens(frame: Frame, photo: Photo) -> pycolmap.Camera:
@@ -139,7 +137,7 @@ def transforms_json(solved: SolvedCameras, region: Region) -> dict[str, Any]:
 
 
 def _frame(view: View, lens: Lens) -> dict[str, Any]:
-    """Inverse of frame_lens and camera_from_world."""
+    """Inverse of frame_lens and world_from_camera."""
     colmap = colmap_lens(lens)
     focal_and_centre = (
         colmap.focal_length_x,

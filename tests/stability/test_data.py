@@ -15,8 +15,9 @@ import torch
 import trimesh
 
 from backend.errors import ErrorCode, ReconstructionError
-from backend.maths.correlation import correlation, patch_statistics
+from backend.maths.correlation import correlation, patch_statistics, window_sum
 from backend.maths.evidence import merged_points
+from backend.maths.geometry import epipolar_map, pixel_centres, sample_image, warp_pixels
 from backend.maths.nearest import nearest_tree
 from backend.maths.projection import projected, shown
 from backend.scene import (
@@ -188,7 +189,7 @@ def white(_index: int, image: Image) -> Image:
 
 def overexposed(_index: int, image: Image) -> Image:
     """Half of the body is white in some channel."""
-    return np.clip(3 * image, 0, 1)
+    return np.clip(7 * image, 0, 1)
 
 
 def one_black(index: int, image: Image) -> Image:
@@ -317,8 +318,8 @@ def test_cameras_of_textures_that_repeat(
         assert np.degrees(np.arccos(min(cosine, 1.0))) < most_deg
 
 
-def first_windows(scene: Scene) -> list[Window]:
-    return [pyramid(view, true_region(), StereoConfig(), CPU)[0] for view in scene.views]
+def windows_of(scene: Scene, size: int = 0) -> list[Window]:
+    return [pyramid(view, true_region(), StereoConfig(), CPU)[size] for view in scene.views]
 
 
 def true_inverse_depth(scene: Scene, view: int, window: Window) -> torch.Tensor:
@@ -329,12 +330,18 @@ def true_inverse_depth(scene: Scene, view: int, window: Window) -> torch.Tensor:
     return torch.tensor(found, dtype=torch.float32)
 
 
-def test_the_mean_over_sources_believes_a_black_one_and_the_soft_maximum_does_not(
-    monkeypatch: pytest.MonkeyPatch,
+def one_hidden(index: int, image: Image) -> Image:
+    """Something is before the third camera alone."""
+    return np.random.default_rng(99).random(image.shape) if index == 2 else image
+
+
+@pytest.mark.parametrize("spoil", [one_black, one_hidden])
+def test_the_mean_over_sources_believes_a_spoiled_one_and_the_soft_maximum_does_not(
+    spoil: Callable[[int, Image], Image], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """At the true depth, between one good source and a black one; 0.98 is seen, and by the mean 0.49."""
+    """At the true depth, between one good source and another; 0.98 is seen, and by the mean 0.49."""
     scene = photographed(arc_cameras(3, 40, 80))
-    good, black = first_windows(scene), first_windows(with_images(scene, one_black))
+    good, spoiled = windows_of(scene), windows_of(with_images(scene, spoil))
     there = true_inverse_depth(scene, 1, good[1])
     on = good[1].subject & (there > 0)
 
@@ -343,10 +350,35 @@ def test_the_mean_over_sources_believes_a_black_one_and_the_soft_maximum_does_no
         return float(found[0][on].median())
 
     assert agreed(good) > 0.9
-    assert agreed(black) > 0.85
+    assert agreed(spoiled) > 0.85
     monkeypatch.setattr(patch_agreement, "_SELECTIVITY", 1e9)  # all sources weigh alike
     assert agreed(good) > 0.9
-    assert agreed(black) < 0.55
+    assert agreed(spoiled) < 0.55
+
+
+def half_white(_index: int, image: Image) -> Image:
+    """Overexposed above the middle."""
+    return np.clip(image + (np.arange(len(image)) < len(image) // 2)[:, None, None], 0, 1)
+
+
+def test_differences_take_white_for_agreement_at_any_depth_and_correlation_for_nothing() -> None:
+    """A tenth too near, right, and a tenth too far; white patches differ by nothing at all three."""
+    scene = with_images(photographed(arc_cameras(2, 30, 80)), half_white)
+    window, other = windows_of(scene, size=-1)
+    tried = true_inverse_depth(scene, 0, window) * torch.tensor([1.1, 1.0, 0.9])[:, None, None]
+    # less the mean around, white is 0
+    white = window_sum((window.grey.abs() < 1e-6).float(), window.patches.radius)
+    on = (white == white.max()) & (tried[0] > 0) & window.subject
+    assert on.sum() > 200
+    where = warp_pixels(
+        *epipolar_map(other.camera, window.camera),
+        pixel_centres(window.camera.width, window.camera.height, CPU),
+        tried,
+    )
+    difference = (sample_image(other.grey[None], where)[:, 0] - window.grey).abs()
+    assert difference[:, on].median(dim=1).values.max() < 1e-6
+    agreed = agreement_in_torch(window, [other], tried, on)[:, on]
+    assert agreed.quantile(0.95, dim=1).max() < 0.1
 
 
 @pytest.mark.parametrize("texture", [stripes_srgb, mirrored_srgb])
@@ -356,7 +388,7 @@ def test_best_matches_of_textures_that_repeat_are_right_where_the_other_photogra
     """The best of 128 depths, two photographs; 29 and 17 % are 3 % off, and 2.4 and 1.4 % of those left."""
     monkeypatch.setattr(synthetic_scene, "texture_srgb", texture)
     scene = photographed(arc_cameras(2, 30, 80))
-    windows = first_windows(scene)
+    windows = windows_of(scene)
     depths = torch.linspace(1 / 6, 1 / 2.2, 128)
     best = []
     for window, other in (windows, windows[::-1]):

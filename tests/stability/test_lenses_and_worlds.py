@@ -1,5 +1,6 @@
 """Very long and very short lenses, and scenes of any size anywhere: the result is the same up to scale."""
 
+import json
 import math
 from dataclasses import dataclass, replace
 from functools import cache, partial
@@ -37,7 +38,9 @@ from backend.scene import (
 )
 from backend.stages import structure_from_motion
 from backend.stages.cameras import CamerasConfig, solve_cameras
+from backend.stages.known_cameras import read_cameras
 from backend.stages.mesh import MeshConfig, extract_mesh
+from backend.stages.nerfstudio import OPENCV_FROM_OPENGL
 from backend.stages.region import RegionConfig, find_region
 from backend.stages.stereo import match_views
 from backend.stages.stereo_config import StereoConfig
@@ -283,6 +286,30 @@ def test_the_result_is_the_same_in_any_world(scale: float, shift: float, masks: 
     one_way = from_surface(vertices, known.vertices, known.faces)
     other_way = from_surface(known.vertices, vertices, mesh.faces)
     assert max(one_way.max(), other_way.max()) < 1e-4 * size
+
+
+@pytest.mark.parametrize("digits", [4, 6, 16])
+def test_cameras_from_a_file_stand_where_it_says_far_from_the_origin_too(digits: int, tmp_path: Path) -> None:
+    """A rotation of few digits, inverted before it is made exact, moves the camera by 1e6 times its error."""
+    scene, offset = small_scene(), np.array([1e6, -1e6, 1e6])
+    frames, moved_by = [], []
+    for name, camera in zip("abc", (view.camera for view in scene.views), strict=False):
+        pose = np.linalg.inv(camera.camera_from_world)
+        pose[:3, :3] = pose[:3, :3].round(digits)
+        pose[:3, 3] += offset
+        left, _, right = np.linalg.svd(np.linalg.inv(pose)[:3, :3])
+        usual = np.linalg.inv(pose)[:3, 3]
+        moved_by.append(np.linalg.norm(-(left @ right).T @ usual - pose[:3, 3]))
+        matrix = (pose @ OPENCV_FROM_OPENGL).tolist()
+        size = {"w": camera.width, "h": camera.height, "fl_x": camera.fx_px, "fl_y": camera.fy_px}
+        frames.append({"file_path": f"{name}.png", "transform_matrix": matrix, **size})
+    assert (max(moved_by) > 0.1) == (digits < 16)
+    path = tmp_path / "transforms.json"
+    path.write_text(json.dumps({"frames": frames}))
+    for (_, camera), frame in zip(read_cameras(path), frames, strict=True):
+        np.testing.assert_allclose(
+            camera.position, np.array(frame["transform_matrix"])[:3, 3], atol=1e-8, rtol=0
+        )
 
 
 @pytest.mark.slow

@@ -12,7 +12,7 @@ import trimesh
 from backend.commands import rehearsed_files
 from backend.mesh_files import read_mesh, read_sparse, write_mesh, write_sparse
 from backend.scene import no_progress
-from backend.stages.nerfstudio import camera_from_world, read_frames
+from backend.stages.nerfstudio import read_frames, world_from_camera
 from backend.stages.report import ReportConfig, build_report, mesh_facts, report_numbers
 from tests.report_scene import finished_run
 
@@ -49,7 +49,7 @@ def test_cameras_look_at_the_origin_from_five_away(folder: Path) -> None:
     frames = read_frames(folder / "cameras.json")
     assert len(frames) == 3
     for frame in frames:
-        pose = camera_from_world(frame, "a.png")
+        pose = np.linalg.inv(world_from_camera(frame, "a.png"))
         np.testing.assert_allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3), atol=1e-12)
         assert np.linalg.det(pose[:3, :3]) == pytest.approx(1)
         np.testing.assert_allclose(pose[:3, 3], [0, 0, 5], atol=1e-12)
