@@ -116,18 +116,19 @@ def rendered_case(
     name: str | None = None,
     words: tuple[str, ...] = (),
     surroundings: str | None = None,
+    hold_out: bool = True,
 ) -> Case:
-    """Views along an arc (3 over 40 degrees, 6 over 120) or a ring, and between them those held out."""
-    is_ring = num_given > 6
-    total = 2 * num_given if is_ring else 2 * num_given - 1
+    """Views along an arc (3 over 40 degrees, 6 over 120) or a ring, and between them any held out."""
+    is_ring, step = num_given > 6, 2 if hold_out else 1
+    total = step * num_given if is_ring else step * (num_given - 1) + 1
     arc_deg = "40" if num_given <= 3 else "120"
     layout = ("--layout", "ring") if is_ring else ("--layout", "arc", "--arc-deg", arc_deg)
     full_name = f"{name or scene}_{num_given}"
     return Case(
         name=full_name,
         folder=full_name,
-        given=tuple(range(0, total, 2)),
-        held_out=tuple(range(1, total, 2)),
+        given=tuple(range(0, total, step)),
+        held_out=tuple(range(1, total, step)) if hold_out else (),
         truth="truth.ply",
         surroundings=surroundings,
         rendering=Rendering(scene=scene, words=("--views", str(total), *layout, *words)),
@@ -148,6 +149,21 @@ _MESHES = (
     ("toy", "mesh_untextured/cheburashka.obj", ("--surface", "spots")),
 )
 _NUM_VIEWS = (3, 6, 12)
+
+_FINE, _OWN = ("--surface", "fine"), ()
+_SIDES = (
+    ("cow_fine", "mesh_spot/spot.obj", _FINE),
+    ("duck_fine", "mesh_bob/bob_tri.obj", _FINE),
+    ("toy_fine", "mesh_untextured/cheburashka.obj", _FINE),
+    ("rocker_fine", "mesh_untextured/rocker-arm.obj", _FINE),
+    ("bottle_fine", "mesh_fuze/fuze.obj", _FINE),
+    ("fandisk_fine", "mesh_untextured/fandisk.obj", _FINE),
+    ("cow", "mesh_spot/spot.obj", ("--exposure-stops", "-0.6")),
+    ("duck", "mesh_bob/bob_tri.obj", _OWN),
+    ("toy", "mesh_untextured/cheburashka.obj", ("--surface", "spots")),
+)
+"""The first six with fine texture, the others painted."""
+_TURNS_DEG = (0, 60, 120, 180)
 
 _DTU, _TEMPLE, _WALNUT = "photos_dtu_scan118_3view", "photos_temple_sparse_ring", "photos_robovision_1"
 _FOUNTAIN, _BANANA, _BERLIN = "photos_fountain_p11", "photos_banana", "photos_berlin3"
@@ -193,6 +209,20 @@ SUITES = MappingProxyType(
                         for name, path, words in _MESHES
                         for count in _NUM_VIEWS
                     ),
+                ),
+            ),
+            Suite(
+                name="sides",
+                cases=tuple(
+                    rendered_case(
+                        scene,
+                        3,
+                        name=f"{name}_{turn_deg}",
+                        words=("--turn-deg", str(turn_deg), *words),
+                        hold_out=False,
+                    )
+                    for name, scene, words in _SIDES
+                    for turn_deg in _TURNS_DEG
                 ),
             ),
             Suite(name="photos", cases=_PHOTO_CASES),

@@ -68,6 +68,15 @@ def test_given_views_of_a_scene_lie_evenly_with_one_held_out_between_two(
     assert kind in case.rendering.words
 
 
+@pytest.mark.parametrize("num_given", [3, 6, 12])
+def test_without_any_held_out_as_many_views_are_rendered_as_are_given(num_given: int) -> None:
+    case = rendered_case("monkey", num_given, hold_out=False)
+    assert case.given == tuple(range(num_given))
+    assert case.held_out == ()
+    assert case.rendering is not None
+    assert str(num_given) in case.rendering.words
+
+
 def test_cases_are_found_where_all_their_files_are(tmp_path: Path) -> None:
     scene = rendered_case("monkey", 3)
     photos = Case(name="photos", folder="set", given=(0, 1, 2), cameras=None)
