@@ -81,11 +81,11 @@ DATA ?= $(wildcard ../shared/data)
 
 # Renders what is missing or out of date, then measures what is not known yet or has changed.
 benchmark: .venv/.ready .venv-blender/.ready
-	$(BPY) -m benchmarks.render_scenes $(SUITE) --output $(BENCHMARK)/scenes $(if $(DATA),--data $(DATA))
+	$(BPY) -m benchmarks.render_scenes $(SUITE) --output $(BENCHMARK)/rendered $(if $(DATA),--data $(DATA))
 	$(BACKEND) -m backend benchmark $(SUITE) --output $(BENCHMARK)/$(SUITE) --seeds $(SEEDS) --presets $(PRESETS) \
 	    $(if $(BUDGETS),--budgets $(BUDGETS)) $(if $(ONLY_BUDGETS),--only-budgets) \
 	    $(if $(RECORD),--record $(RECORD)) \
-	    --scenes $(BENCHMARK)/scenes $(if $(DATA),--photos $(DATA))
+	    --scenes $(BENCHMARK)/rendered $(if $(DATA),--photos $(DATA))
 
 # For CI: the suite `quick`, its numbers within loose bounds.
 quick:
@@ -95,14 +95,14 @@ quick:
 CASES ?= monkey_3 plaster_6
 
 ablation: .venv/.ready .venv-blender/.ready
-	$(BPY) -m benchmarks.render_scenes --cases $(CASES) --output $(BENCHMARK)/scenes $(if $(DATA),--data $(DATA))
+	$(BPY) -m benchmarks.render_scenes --cases $(CASES) --output $(BENCHMARK)/rendered $(if $(DATA),--data $(DATA))
 	$(BACKEND) -m benchmarks.ablation --cases $(CASES) --seeds $(SEEDS) --output $(BENCHMARK)/ablation \
 	    $(if $(RECORD),--record $(RECORD)) \
-	    --scenes $(BENCHMARK)/scenes $(if $(DATA),--photos $(DATA))
+	    --scenes $(BENCHMARK)/rendered $(if $(DATA),--photos $(DATA))
 
 scaling: .venv/.ready .venv-blender/.ready
-	$(BPY) -m benchmarks.render_scenes --cases monkey_12 --output $(BENCHMARK)/scenes
-	$(BACKEND) -m benchmarks.scaling --case monkey_12 --output $(BENCHMARK)/scaling --scenes $(BENCHMARK)/scenes
+	$(BPY) -m benchmarks.render_scenes --cases monkey_12 --output $(BENCHMARK)/rendered
+	$(BACKEND) -m benchmarks.scaling --case monkey_12 --output $(BENCHMARK)/scaling --scenes $(BENCHMARK)/rendered
 
 points: .venv/.ready
 	$(if $(DATA),,$(error clouds are needed: make points DATA=FOLDER))

@@ -1,6 +1,6 @@
 """What each part is worth: chosen cases with one part changed at a time; run by the backend's Python.
 
-    python -m benchmarks.ablation --scenes build/benchmark/scenes --cases monkey_3 plaster_6 --output DIR
+    python -m benchmarks.ablation --scenes build/benchmark/rendered --cases monkey_3 plaster_6 --output DIR
 
 Each run has a process of its own, because a process knows only one peak of its memory. Leaves table.md and
 results.json, written anew after every run; called again with the same folder it goes on, and measures again

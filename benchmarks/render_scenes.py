@@ -1,7 +1,7 @@
 """Renders the scenes of a benchmark's suite that are not there yet; run by Blender's Python.
 
-    python -m benchmarks.render_scenes SUITE --output build/benchmark/scenes [--data ../shared/data]
-    python -m benchmarks.render_scenes --cases CASE ... --output build/benchmark/scenes
+    python -m benchmarks.render_scenes SUITE --output build/benchmark/rendered [--data ../shared/data]
+    python -m benchmarks.render_scenes --cases CASE ... --output build/benchmark/rendered
 
 A scene is rendered again when its options or the sources of blender_scenes have changed. Without --data the
 cases that start from a mesh file are left out.

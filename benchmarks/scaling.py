@@ -1,6 +1,6 @@
 """How time and memory grow with views, pixels and the grid; run by the backend's Python.
 
-    python -m benchmarks.scaling --scenes build/benchmark/scenes --output DIR
+    python -m benchmarks.scaling --scenes build/benchmark/rendered --output DIR
 
 Each run has a process of its own, because a process knows only one peak of its memory. Leaves table.md and
 results.json, written anew after every sweep.
