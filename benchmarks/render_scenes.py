@@ -25,15 +25,15 @@ MESH_SUFFIXES = frozenset({".obj", ".ply", ".stl", ".glb", ".gltf"})
 logger = logging.getLogger(__name__)
 
 
-def render_words(case: Case, output: Path, data: Path | None) -> tuple[str, ...] | None:
-    """The case as words for blender_scenes.render_views; None where its mesh file is not there."""
+def render_words(case: Case, data: Path | None) -> tuple[str, ...] | None:
+    """The case as words for blender_scenes.render_views, but where to; None where its mesh file is not there."""
     assert case.rendering is not None
     scene = case.rendering.scene
     if Path(scene).suffix in MESH_SUFFIXES:
         if data is None or not (data / scene).is_file():
             return None
         scene = f"mesh:{data.absolute() / scene}"
-    return ("--scene", scene, *case.rendering.words, "--output", str(output.absolute()))
+    return ("--scene", scene, *case.rendering.words)
 
 
 def fingerprint(words: tuple[str, ...]) -> str:
@@ -49,7 +49,7 @@ def render_missing(cases: tuple[Case, ...], scenes: Path, data: Path | None) -> 
     """Render what is missing or out of date; the first exit code that is not 0."""
     for case in cases:
         folder = scenes / case.folder
-        words = render_words(case, folder, data)
+        words = render_words(case, data)
         note = folder / NOTE
         if words is None:
             logger.info("%s is left out: its mesh file is not there", case.name)
@@ -57,7 +57,8 @@ def render_missing(cases: tuple[Case, ...], scenes: Path, data: Path | None) -> 
         if note.is_file() and note.read_text(encoding="utf-8") == fingerprint(words):
             continue
         logger.info("rendering %s", case.name)
-        command = [sys.executable, "-m", "blender_scenes.render_views", *words]
+        where_to = ("--output", str(folder.absolute()))
+        command = [sys.executable, "-m", "blender_scenes.render_views", *words, *where_to]
         exit_code = subprocess.run(command, cwd=ROOT, check=False).returncode
         if exit_code:
             return exit_code
