@@ -26,7 +26,7 @@ logger = logging.getLogger(__name__)
 
 
 def render_words(case: Case, data: Path | None) -> tuple[str, ...] | None:
-    """The case as words for blender_scenes.render_views, but where to; None where its mesh file is not there."""
+    """The case as words for blender_scenes.render_views, without where to; None without its mesh file."""
     assert case.rendering is not None
     scene = case.rendering.scene
     if Path(scene).suffix in MESH_SUFFIXES:
