@@ -189,7 +189,7 @@ def white(_index: int, image: Image) -> Image:
 
 def overexposed(_index: int, image: Image) -> Image:
     """Half of the body is white in some channel."""
-    return np.clip(7 * image, 0, 1)
+    return np.clip(3 * image, 0, 1)
 
 
 def one_black(index: int, image: Image) -> Image:
