@@ -15,6 +15,7 @@ from ..maths.smooth_fit import fit_smooth
 from .inner_outlines import FarSide
 from .measurements import Measurements
 from .rims import RimRays, rim_points, rim_rays
+from .shared_brightness import ShownPlaces
 from .silhouettes import SilhouetteRays, inside_along, least_distance, middles, silhouette_rays
 from .unseen_side import ball_behind, depth_is_bounded
 
@@ -36,6 +37,8 @@ class LinearConfig:
     """In front of what was measured, where the field says otherwise."""
     inner_outlines: bool = True
     """Whether bridges are looked for where photographs show that one part hides another."""
+    brightness: float = 1.0
+    """Of places that brightness tells where no texture does, on the finest grid; 0 not to look for any."""
     silhouettes: float = 0.2
     """On rays through the subject that miss the field."""
     rims: float = 0.2
@@ -66,18 +69,26 @@ def fit_level(
     rounds: int,
     config: LinearConfig,
     far: Sequence[FarSide] = (),
+    shown: ShownPlaces | None = None,
+    begin: Float[Tensor, "nodes nodes nodes"] | None = None,
 ) -> Float[Tensor, "nodes nodes nodes"]:
     """The smoothest field near the points' planes that silhouettes allow, else like the level before.
 
     Smooth is measured against the ball behind, whose curvature is free. Free space (f > 0) and silhouettes
     (f < 0 somewhere on each ray) are inequalities: they pull only where the field says otherwise, which
     takes a few rounds; `rounds` at most, fewer where the surface comes to rest. What is before `far` sides is
-    free as what is before measured depth.
+    free as what is before measured depth. Places `shown` by brightness are points as well. With `begin`, a
+    field of the same grid, the rounds go on from there.
     """
     nodes = before.shape[0]
     h = spacing(nodes)
     sure = scene.confidence**config.confidence_power
-    points = merged_points(scene.positions, scene.normals, sure, h / 2, correlated=config.correlated)
+    positions, normals = scene.positions, scene.normals
+    if shown is not None:
+        positions = torch.cat([positions, shown.positions])
+        normals = torch.cat([normals, shown.normals])
+        sure = torch.cat([sure, config.brightness * shown.weights])
+    points = merged_points(positions, normals, sure, h / 2, correlated=config.correlated)
     measured = point_distances(*points, nodes, spread_cells=config.spread_cells)
     measured_weight = measured.weight.clamp(max=4.0)
     ball = ball_behind(scene, radius, nodes)
@@ -89,7 +100,7 @@ def fit_level(
     through_subject, pulled = silhouette_rays(scene, nodes), torch.zeros((nodes**3, 2), device=before.device)
     met_along = torch.full_like(through_subject.entry, torch.inf)
     rays, nearest = rim_rays(scene, nodes), nearest_tree(points[0].cpu().numpy())
-    distance = before
+    distance = before if begin is None else begin
     for _ in range(rounds):
         target, weight = before.clone(), torch.full_like(before, config.prior * (32 / nodes) ** 2)
         carved = free & (distance < bound)

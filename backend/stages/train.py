@@ -10,17 +10,24 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from ..maths.grid import refined, spacing
 from ..scene import Decision, Progress, Region, StereoResult, View, within
-from .deadline import Clock, GridCost, deadline_after, finest_grid, predicted_s
+from .deadline import Clock, Deadline, GridCost, deadline_after, finest_grid, predicted_s
 from .inner_outlines import FarSide, decision, far_sides
 from .linear_fit import LinearConfig, fit_level, start
 from .measurements import Measurements, carried, measurements
 from .render_fit import RenderConfig, refine
 from .safe_steps import not_finite
+from .shared_brightness import ShownPlaces, shared_brightness
+from .shared_brightness import decision as of_brightness
 from .surface import COARSEST, ShowSurface, Surface, show_nothing, tight_frame
 from .unseen_depth import depth_behind
+
+_PASSES = 2
+"""How often photographs' brightness is asked on the finest grid, each time from the field so far."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -72,6 +79,7 @@ def fit_surface(
     total = sum(config.steps) + 10 * len(config.levels)
     done, rendered, taken_back = 0, 0, 0
     told: list[FarSide] = []
+    shown: list[ShownPlaces] = []
     for wanted, rounds, steps in zip(config.levels, config.rounds, config.steps, strict=True):
         nodes = finest_grid(costs, len(distance), wanted, deadline.left_s())
         if nodes == len(distance) < wanted:
@@ -83,7 +91,13 @@ def fit_surface(
             is_second = config.linear.inner_outlines and len(costs) == 2
             far = far_sides(scene, distance) if is_second else []
             told += far
-            distance = fit_level(scene, refined(distance, nodes), radius, rounds, config.linear, far)
+            before = refined(distance, nodes)
+            distance = fit_level(scene, before, radius, rounds, config.linear, far)
+            if nodes == config.levels[-1]:
+                least_s = clock() - began_s
+                distance, shown = _by_brightness(
+                    scene, before, distance, radius, far, config.linear, deadline, least_s
+                )
         done += 10
         show(Surface(distance=distance.cpu().numpy(), grid_from_world=frame.object_from_world))
         costs.append(GridCost(nodes=nodes, seconds=clock() - began_s))
@@ -95,11 +109,34 @@ def fit_surface(
             taken_back += better.taken_back
             done += steps
     made = _decisions(scene, frame, config, depth, nodes=len(distance), rendered=rendered)
-    made = (*made, decision(told), _of_rendering(config, rendered, taken_back))
+    made = (*made, decision(told), of_brightness(shown), _of_rendering(config, rendered, taken_back))
     if config.budget_s is not None:
         used_s = config.budget_s - deadline.left_s()
         made = (*made, _of_budget(config.budget_s, used_s, config, costs, rendered))
     return Surface(distance=distance.cpu().numpy(), grid_from_world=frame.object_from_world, decisions=made)
+
+
+def _by_brightness(
+    scene: Measurements,
+    before: Float[Tensor, "nodes nodes nodes"],
+    distance: Float[Tensor, "nodes nodes nodes"],
+    radius: float,
+    far: Sequence[FarSide],
+    config: LinearConfig,
+    deadline: Deadline,
+    least_s: float,
+) -> tuple[Float[Tensor, "nodes nodes nodes"], list[ShownPlaces]]:
+    """The field of a level, fitted on to what brightness tells, and what that was in each pass.
+
+    A pass does less than the level's fit did: where not even the time for that is left, it is left out.
+    """
+    shown: list[ShownPlaces] = []
+    while config.brightness and len(shown) < _PASSES and deadline.left_s() > least_s:
+        shown.append(shared_brightness(scene, distance))
+        if not len(shown[-1].weights):
+            break
+        distance = fit_level(scene, before, radius, 1, config, far, shown[-1], distance)
+    return distance, shown
 
 
 def _of_budget(

@@ -1,0 +1,251 @@
+"""Places that brightness tells: a surface without texture, but matt and shaded.
+
+Patches are compared without their mean and say nothing where there is only shading, which on smooth
+things is most of what photographs see. Where two photographs see the same place of the field and
+brightness changes evenly along the rays, the depth at which both are equally bright is a measurement
+(maths/brightness.py).
+
+How far it can be trusted is measured twice: by what differs where patches do agree, averaged over so many
+places that their texture evens out (on what shines, brightness depends on the view, and the average shows
+it); and by what one step leaves unexplained in a window (texture, edges, something else in front).
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Bool, Float, Int64
+from scipy.ndimage import binary_erosion, gaussian_filter
+from torch import Tensor
+
+from ..maths.brightness import depth_steps, exposure_ratio, means_of_cells, slopes_along
+from ..maths.geometry import Pinhole, pixel_centres, project, ray_directions, sample_image
+from ..maths.grid import locate, spacing, value_and_gradient
+from ..maths.srgb import linear_from_srgb
+from ..scene import Decision
+from .measurements import SURE, Measurements
+from .silhouettes import grid_crossing, grid_entry
+from .stereo_windows import neighbours
+
+_PLAIN = 0.5
+"""Where patches agree on a larger share of the subject's pixels, what is left is hidden or beside edges."""
+_PARTNERS = 4
+"""Photographs that each one is compared with, at most."""
+_SHARE = 0.5
+"""Of the photographs' size at which brightness is looked at."""
+_BLUR_PX = 1.0
+"""There; noise is averaged, shading is left."""
+_MARGIN_PX = 3
+"""From what misses the field, across which the blur would reach."""
+_WINDOW_PX = 1
+"""Half a window's side."""
+_LEAST_COSINE = 0.25
+"""Between the normal and a ray: what turns away further is seen too foreshortened, or is a bridge."""
+_SAME_CELLS = 2.5
+"""Two photographs see the same place if their depths of it differ by at most that."""
+_LONGEST_CELLS = 4.0
+"""A step's length; from farther off, another place may be as bright."""
+_FEWEST_SURE = 200
+"""Places that patches agree on, of two photographs, to judge their brightness by."""
+_CELL = 6.0
+"""Side of a box, in cells of the grid, over which differences are averaged."""
+_FEWEST_IN_BOX = 20
+"""Places in it that patches agree on."""
+_LEAST_DIFFERENCE = 0.001
+"""Between photographs, in linear light: a third of eight bits' step."""
+_SURE_DEVIATION = 0.002
+"""Of the depth of a sure stereo point, in half widths of the grid; what is as good weighs as much."""
+_LARGEST_DEVIATION = 0.02
+"""Of a depth that is told."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ShownPlaces:
+    """Oriented points that brightness tells."""
+
+    positions: Float[Tensor, "points 3"]
+    normals: Float[Tensor, "points 3"]
+    weights: Float[Tensor, "points"]
+    """Beside a sure stereo point, 0 to 1."""
+
+
+def shared_brightness(scene: Measurements, distance: Float[Tensor, "nodes nodes nodes"]) -> ShownPlaces:
+    """Where the field's surface should be, of all places that two photographs see and patches do not tell."""
+    if _sure_share(scene) > _PLAIN:
+        return _together([])
+    pictures = [_picture(scene, index, distance) for index in range(len(scene.cameras))]
+    partners = neighbours(scene.cameras, _PARTNERS)
+    compared = [
+        compared
+        for picture, others in zip(pictures, partners, strict=True)
+        for other in others
+        if (compared := _compared(picture, pictures[other], len(distance))) is not None
+    ]
+    differences = torch.cat([torch.zeros(0), *(pair.differences.cpu() for pair in compared)])
+    if not len(differences):
+        return _together([])
+    # a normal law's standard deviation by the median
+    by_view = max(1.4826 * float(differences.abs().median()), _LEAST_DIFFERENCE)
+    return _together([_told(pair, by_view) for pair in compared])
+
+
+def decision(shown: Sequence[ShownPlaces]) -> Decision:
+    """What it was worth in a fit's passes, for the report."""
+    what, count = "brightness without texture", max((len(s.weights) for s in shown), default=0)
+    if not shown:
+        because = "not asked for, or time ran out before it"
+    elif not count:
+        because = "patches agree on most of the subject, or what they agree on is not equally bright"
+    else:
+        because = f"the same from two sides, it tells the depth of {count} places that no texture tells"
+    return Decision(what=what, choice="used" if count else "left out", because=because)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Picture:
+    """A photograph's brightness, and the places of the field that its pixels see."""
+
+    camera: Pinhole
+    """Of a smaller picture."""
+    brightness: Float[Tensor, "height width"]
+    """Linear light."""
+    depth: Float[Tensor, "height width"]
+    """Of the field, along the axis; 0 where it is missed or the blur reaches across its edge."""
+    pixel: Int64[Tensor, "places"]
+    """Number of the pixel, row by row."""
+    positions: Float[Tensor, "places 3"]
+    normals: Float[Tensor, "places 3"]
+    directions: Float[Tensor, "places 3"]
+    """Away from the camera."""
+    sure: Bool[Tensor, "places"]
+    """Whether patches agree there."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Compared:
+    """What two photographs show of the same places."""
+
+    differences: Float[Tensor, "boxes"]
+    """Of brightness, where patches agree, averaged."""
+    positions: Float[Tensor, "places 3"]
+    """Where brightness agrees, for all other places."""
+    normals: Float[Tensor, "places 3"]
+    slope: Float[Tensor, "places"]
+    left_over: Float[Tensor, "places"]
+
+
+def _sure_share(scene: Measurements) -> float:
+    """Of the subject's pixels, or of all where it is not known, those on which patches agree."""
+    subjects = [
+        torch.ones_like(confidence, dtype=torch.bool) if subject is None else subject < 0
+        for subject, confidence in zip(scene.certain, scene.confidences, strict=True)
+    ]
+    sure = [(c[on] > SURE).sum() for c, on in zip(scene.confidences, subjects, strict=True)]
+    return float(sum(sure) / max(sum(int(on.sum()) for on in subjects), 1))
+
+
+def _picture(scene: Measurements, index: int, distance: Float[Tensor, "nodes nodes nodes"]) -> _Picture:
+    whole, subject, device = scene.cameras[index], scene.certain[index], distance.device
+    camera = whole.scaled(max(round(_SHARE * whole.width), 1), max(round(_SHARE * whole.height), 1))
+    size = (camera.height, camera.width)
+    asked = (
+        torch.ones(size, dtype=torch.bool, device=device) if subject is None else _at_size(subject, size) < 0
+    )
+    along_axis = ray_directions(camera, pixel_centres(camera.width, camera.height, device)[asked])
+    directions = F.normalize(along_axis, dim=-1)
+    origins = camera.position.expand_as(directions)
+    crossing = grid_crossing(distance, origins, directions, grid_entry(origins, directions))
+    depth = torch.zeros(size, device=device)
+    depth[asked] = torch.where(crossing.hit, crossing.along / along_axis.norm(dim=-1), 0.0)
+    seen = depth > 0
+    inner = torch.tensor(binary_erosion(seen.cpu().numpy(), iterations=_MARGIN_PX), device=device)
+    positions = origins + crossing.along[:, None] * directions
+    _, gradient = value_and_gradient(distance, locate(positions, len(distance)))
+    normals = F.normalize(gradient, dim=-1)
+    wanted = inner[asked] & (-(normals * directions).sum(dim=-1) > _LEAST_COSINE)
+    return _Picture(
+        camera=camera,
+        brightness=_brightness(scene.images[index], seen),
+        depth=torch.where(inner, depth, 0.0),
+        pixel=torch.nonzero(asked.flatten())[wanted, 0],
+        positions=positions[wanted],
+        normals=normals[wanted],
+        directions=directions[wanted],
+        sure=(_at_size(scene.confidences[index], size) > SURE)[asked][wanted],
+    )
+
+
+def _at_size(image: Float[Tensor, "height width"], size: tuple[int, int]) -> Float[Tensor, "rows columns"]:
+    return F.interpolate(image[None, None], size=size, mode="nearest-exact")[0, 0]
+
+
+def _brightness(
+    image_srgb: Float[Tensor, "3 height width"], seen: Bool[Tensor, "rows columns"]
+) -> Float[Tensor, "rows columns"]:
+    """Grey, blurred over the seen pixels alone."""
+    small = F.interpolate(image_srgb[None], size=tuple(seen.shape), mode="area")[0]
+    grey = linear_from_srgb(small.cpu().numpy()).mean(axis=0)
+    on = seen.cpu().numpy().astype(grey.dtype)
+    share = gaussian_filter(on, _BLUR_PX)
+    blurred = gaussian_filter(grey * on, _BLUR_PX) / share.clip(min=1e-6)
+    return torch.tensor(blurred, dtype=torch.float32, device=seen.device)
+
+
+def _compared(one: _Picture, other: _Picture, nodes: int) -> _Compared | None:
+    """What another photograph shows of the places of one; None if too little is known to judge it by."""
+    h = spacing(nodes)
+    at, depth = project(other.camera, one.positions)
+    seen_depth = sample_image(other.depth[None], at[None, None], "nearest")[0, 0, 0]
+    towards = F.normalize(other.camera.position - one.positions, dim=-1)
+    same = (depth > 0) & (seen_depth > 0) & ((seen_depth - depth).abs() < _SAME_CELLS * h)
+    same &= (one.normals * towards).sum(dim=-1) > _LEAST_COSINE
+    positions, normals, directions = one.positions[same], one.normals[same], one.directions[same]
+    pixel, sure = one.pixel[same], one.sure[same]
+    if int(sure.sum()) < _FEWEST_SURE:
+        return None
+
+    def shown(along: float) -> Float[Tensor, "places"]:
+        pixels, _ = project(other.camera, positions + along * directions)
+        return sample_image(other.brightness[None], pixels[None, None])[0, 0, 0]
+
+    def in_picture(values: Float[Tensor, "places"]) -> Float[Tensor, "height width"]:
+        return torch.zeros_like(one.brightness).flatten().index_put_((pixel,), values).view_as(one.brightness)
+
+    here, there = one.brightness.flatten()[pixel], shown(0.0)
+    difference = here * exposure_ratio(here[sure], there[sure]) - there
+    along = slopes_along(shown(-h), there, shown(h), h)
+    known = in_picture(along.straight.float()) > 0
+    steps = depth_steps(in_picture(difference), in_picture(along.slope), known, _WINDOW_PX)
+    step, slope, left_over = (x.flatten()[pixel] for x in (steps.step, steps.slope, steps.left_over))
+    _, box = torch.unique(torch.floor(positions[sure] / (_CELL * h)), dim=0, return_inverse=True)
+    told = along.straight & ~sure & (step.abs() < _LONGEST_CELLS * h)
+    return _Compared(
+        differences=means_of_cells(difference[sure], box, _FEWEST_IN_BOX),
+        positions=positions[told] + step[told, None] * directions[told],
+        normals=normals[told],
+        slope=slope[told],
+        left_over=left_over[told],
+    )
+
+
+def _told(pair: _Compared, by_view: float) -> ShownPlaces:
+    """The places that are told well enough, by how much brightness depends on the view."""
+    deviation = (pair.left_over.square() + by_view**2).sqrt() / pair.slope
+    kept = deviation < _LARGEST_DEVIATION
+    return ShownPlaces(
+        positions=pair.positions[kept],
+        normals=pair.normals[kept],
+        weights=(_SURE_DEVIATION / deviation[kept]).square().clamp(max=1.0),
+    )
+
+
+def _together(parts: Sequence[ShownPlaces]) -> ShownPlaces:
+    nothing = torch.zeros((0, 3))
+    if not parts:
+        return ShownPlaces(positions=nothing, normals=nothing, weights=nothing[:, 0])
+    return ShownPlaces(
+        positions=torch.cat([part.positions for part in parts]),
+        normals=torch.cat([part.normals for part in parts]),
+        weights=torch.cat([part.weights for part in parts]),
+    )

@@ -1,0 +1,156 @@
+"""A matt ball under an even light, whose field is too large where nothing was measured: brightness tells."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float
+from torch import Tensor
+
+from backend.maths.geometry import Pinhole, pixel_centres, ray_directions, unproject
+from backend.maths.grid import node_positions, read, spacing
+from backend.stages.linear_fit import LinearConfig, fit_level
+from backend.stages.measurements import Measurements
+from backend.stages.shared_brightness import ShownPlaces, decision, shared_brightness
+
+NODES, SIZE, RADIUS = 64, 320, 0.6
+TOO_LARGE = 0.03
+"""By how much the field is, above: about a cell."""
+LIGHT = F.normalize(torch.tensor([1.0, 0.7, -0.5]), dim=0)
+
+Field = Float[Tensor, "nodes nodes nodes"]
+
+
+def camera(angle_deg: float) -> Pinhole:
+    """Three units away from the middle, turned about y."""
+    a = math.radians(angle_deg)
+    camera_from_object = torch.eye(4)
+    camera_from_object[:3, :3] = torch.tensor(
+        [[math.cos(a), 0, -math.sin(a)], [0, 1, 0], [math.sin(a), 0, math.cos(a)]]
+    )
+    camera_from_object[2, 3] = 3.0
+    intrinsics = torch.tensor([[600.0, 0, SIZE / 2], [0, 600, SIZE / 2], [0, 0, 1]])
+    return Pinhole(intrinsics=intrinsics, camera_from_object=camera_from_object, width=SIZE, height=SIZE)
+
+
+def too_large(by: float = TOO_LARGE) -> Field:
+    """Right for y < 0, where points are."""
+    nodes = node_positions(NODES, torch.device("cpu"))
+    return nodes.norm(dim=-1) - RADIUS - by * (nodes[..., 1] / 0.1).clamp(0, 1)
+
+
+def scene(*, shine: float = 0.0, exposure: float = 1.0, known_up_to: float = 0.0) -> Measurements:
+    """Points are sure where y < `known_up_to`; `shine` is what a mirroring lobe adds to brightness."""
+    cameras = [camera(-12), camera(12)]
+    images, outlines, depths, confidences, positions = [], [], [], [], []
+    for index, one in enumerate(cameras):
+        rays = ray_directions(one, pixel_centres(SIZE, SIZE, torch.device("cpu")))
+        a, b = (rays * rays).sum(-1), (rays * one.position).sum(-1)
+        root = b * b - a * (one.position.square().sum() - RADIUS**2)
+        on = root > 0
+        depth = torch.where(on, (-b - root.clamp(min=0).sqrt()) / a, 0.0)
+        points = unproject(one, pixel_centres(SIZE, SIZE, torch.device("cpu")), depth)
+        normals = points / RADIUS
+        matt = 0.05 + 0.6 * (normals @ LIGHT).clamp(min=0)
+        to_camera = F.normalize(one.position - points, dim=-1)
+        halfway = F.normalize(to_camera + LIGHT, dim=-1)
+        light = (matt + shine * (normals * halfway).sum(-1).clamp(min=0) ** 4) * (exposure if index else 1.0)
+        images.append(torch.where(on, _srgb(light.clamp(max=1)), 0.0).expand(3, -1, -1))
+        outlines.append(torch.where(on, -5.0, 5.0))
+        known = on & (points[..., 1] < known_up_to)
+        depths.append(torch.where(known, depth, 0.0))
+        confidences.append(0.8 * known)
+        positions.append(points[known])
+    points = torch.cat(positions)
+    return Measurements(
+        cameras=cameras,
+        images=images,
+        masks=[None, None],
+        outlines=[*outlines],
+        backdrops=[None, None],
+        certain=[*outlines],
+        depths=depths,
+        confidences=confidences,
+        positions=points,
+        normals=F.normalize(points, dim=-1),
+        colours=torch.zeros_like(points),
+        confidence=torch.full((len(points),), 0.8),
+        region_centre=torch.zeros(3),
+        region_radius=1.0,
+    )
+
+
+def _srgb(light: Tensor) -> Tensor:
+    """IEC 61966-2-1."""
+    return torch.where(light <= 0.0031308, 12.92 * light, 1.055 * light.clamp(min=1e-4) ** (1 / 2.4) - 0.055)
+
+
+def error(places: Float[Tensor, "points 3"]) -> float:
+    return float((places.norm(dim=-1) - RADIUS).abs().median())
+
+
+@pytest.mark.parametrize("exposure", [1.0, 0.6])
+def test_places_are_told_where_nothing_was_measured(exposure: float) -> None:
+    shown = shared_brightness(scene(exposure=exposure), too_large())
+    assert len(shown.weights) > 2000
+    assert float((shown.positions[:, 1] > -0.05).float().mean()) > 0.99  # below are points already
+    assert error(shown.positions[shown.positions[:, 1] > 0.1]) < 0.15 * TOO_LARGE
+    assert float(shown.weights.min()) > 0
+    assert float(shown.weights.max()) <= 1
+    torch.testing.assert_close(shown.normals.norm(dim=-1), torch.ones(len(shown.normals)))
+
+
+def test_a_second_look_is_nearer_than_the_first() -> None:
+    measured = scene()
+    first = shared_brightness(measured, too_large())
+    nearer = too_large(0.2 * TOO_LARGE)
+    second = shared_brightness(measured, nearer)
+    assert error(second.positions) < error(first.positions)
+
+
+def test_the_more_it_shines_the_less_brightness_counts() -> None:
+    matt, satin, glossy = (
+        float(shared_brightness(scene(shine=shine), too_large()).weights.sum()) for shine in (0, 0.05, 0.4)
+    )
+    assert satin < 0.7 * matt
+    assert glossy < 0.05 * matt
+
+
+def test_nothing_is_told_where_patches_agree_on_most() -> None:
+    assert len(shared_brightness(scene(known_up_to=0.2), too_large()).weights) == 0
+
+
+def test_nothing_is_told_without_places_to_judge_brightness_by() -> None:
+    assert len(shared_brightness(scene(known_up_to=-0.55), too_large()).weights) == 0
+
+
+def test_nothing_is_told_of_an_even_brightness() -> None:
+    measured = scene()
+    even = replace(measured, images=[torch.full_like(image, 0.5) for image in measured.images])
+    assert len(shared_brightness(even, too_large()).weights) == 0
+
+
+def test_a_fit_goes_to_what_was_told() -> None:
+    measured, before = scene(), too_large()
+    shown = shared_brightness(measured, before)
+    asked = ShownPlaces(
+        positions=shown.positions[shown.positions[:, 1] > 0.1],
+        normals=shown.normals[shown.positions[:, 1] > 0.1],
+        weights=shown.weights[shown.positions[:, 1] > 0.1],
+    )
+    without = fit_level(measured, before, RADIUS, 3, LinearConfig())
+    told = fit_level(measured, before, RADIUS, 3, LinearConfig(), shown=asked, begin=without)
+    off = [float(read(field, asked.positions).abs().median()) for field in (without, told)]
+    assert off[1] < 0.5 * off[0]
+    assert off[1] < 0.3 * spacing(NODES)
+
+
+def test_the_report_says_what_it_was_worth() -> None:
+    shown = shared_brightness(scene(), too_large())
+    nothing = shared_brightness(scene(known_up_to=0.2), too_large())
+    assert decision([shown, nothing]).choice == "used"
+    assert str(len(shown.weights)) in decision([shown, nothing]).because
+    assert decision([nothing]).choice == "left out"
+    assert "time" in decision([]).because
