@@ -68,6 +68,7 @@ VARIANTS = (
         changes={"train.linear.seen_through": _NEXT_TO_NOTHING},
     ),
     Variant(name="without outlines inside the subject", changes={"train.linear.inner_outlines": False}),
+    Variant(name="without brightness", changes={"train.linear.brightness": 0.0}),
     Variant(
         name="without any free space",
         changes={
@@ -114,6 +115,7 @@ VARIANTS = (
         changes={"train.linear.inner_outlines": False},
         preset="fast",
     ),
+    Variant(name="fast, without brightness", changes={"train.linear.brightness": 0.0}, preset="fast"),
     Variant(name="fast at full size", changes={"stereo.first_pixel_size": 1}, preset="fast"),
     # what SparseCraft asks of points
     Variant(name="sparsecraft, 400 steps", changes=_SHORT, preset="sparsecraft"),

@@ -45,8 +45,7 @@ def slopes_along(
 ) -> Slopes:
     """Of brightness `reach` before a place, at it, and `reach` behind it."""
     change, bend = farther - nearer, farther + nearer - 2 * here
-    straight = (bend.abs() < STRAIGHT * change.abs()) & (change != 0)
-    return Slopes(slope=change / (2 * reach), straight=straight)
+    return Slopes(slope=change / (2 * reach), straight=bend.abs() < STRAIGHT * change.abs())
 
 
 def depth_steps(

@@ -46,8 +46,6 @@ _SAME_CELLS = 2.5
 """Two photographs see the same place if their depths of it differ by at most that."""
 _LONGEST_CELLS = 4.0
 """A step's length; from farther off, another place may be as bright."""
-_FEWEST_SURE = 200
-"""Places that patches agree on, of two photographs, to judge their brightness by."""
 _CELL = 6.0
 """Side of a box, in cells of the grid, over which differences are averaged."""
 _FEWEST_IN_BOX = 20
@@ -82,9 +80,9 @@ def shared_brightness(scene: Measurements, distance: Float[Tensor, "nodes nodes 
         for other in others
         if (compared := _compared(picture, pictures[other], len(distance))) is not None
     ]
-    differences = torch.cat([torch.zeros(0), *(pair.differences.cpu() for pair in compared)])
-    if not len(differences):
+    if not compared:
         return _together([])
+    differences = torch.cat([pair.differences for pair in compared])
     # a normal law's standard deviation by the median
     by_view = max(1.4826 * float(differences.abs().median()), _LEAST_DIFFERENCE)
     return _together([_told(pair, by_view) for pair in compared])
@@ -202,8 +200,6 @@ def _compared(one: _Picture, other: _Picture, nodes: int) -> _Compared | None:
     same &= (one.normals * towards).sum(dim=-1) > _LEAST_COSINE
     positions, normals, directions = one.positions[same], one.normals[same], one.directions[same]
     pixel, sure = one.pixel[same], one.sure[same]
-    if int(sure.sum()) < _FEWEST_SURE:
-        return None
 
     def shown(along: float) -> Float[Tensor, "places"]:
         pixels, _ = project(other.camera, positions + along * directions)
@@ -214,14 +210,17 @@ def _compared(one: _Picture, other: _Picture, nodes: int) -> _Compared | None:
 
     here, there = one.brightness.flatten()[pixel], shown(0.0)
     difference = here * exposure_ratio(here[sure], there[sure]) - there
+    _, box = torch.unique(torch.floor(positions[sure] / (_CELL * h)), dim=0, return_inverse=True)
+    differences = means_of_cells(difference[sure], box, _FEWEST_IN_BOX)
+    if not len(differences):
+        return None
     along = slopes_along(shown(-h), there, shown(h), h)
     known = in_picture(along.straight.float()) > 0
     steps = depth_steps(in_picture(difference), in_picture(along.slope), known, _WINDOW_PX)
     step, slope, left_over = (x.flatten()[pixel] for x in (steps.step, steps.slope, steps.left_over))
-    _, box = torch.unique(torch.floor(positions[sure] / (_CELL * h)), dim=0, return_inverse=True)
     told = along.straight & ~sure & (step.abs() < _LONGEST_CELLS * h)
     return _Compared(
-        differences=means_of_cells(difference[sure], box, _FEWEST_IN_BOX),
+        differences=differences,
         positions=positions[told] + step[told, None] * directions[told],
         normals=normals[told],
         slope=slope[told],

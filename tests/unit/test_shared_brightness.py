@@ -122,8 +122,9 @@ def test_nothing_is_told_where_patches_agree_on_most() -> None:
     assert len(shared_brightness(scene(known_up_to=0.2), too_large()).weights) == 0
 
 
-def test_nothing_is_told_without_places_to_judge_brightness_by() -> None:
-    assert len(shared_brightness(scene(known_up_to=-0.55), too_large()).weights) == 0
+@pytest.mark.parametrize("known_up_to", [-0.55, -1.0])
+def test_nothing_is_told_without_places_to_judge_brightness_by(known_up_to: float) -> None:
+    assert len(shared_brightness(scene(known_up_to=known_up_to), too_large()).weights) == 0
 
 
 def test_nothing_is_told_of_an_even_brightness() -> None:
@@ -145,6 +146,13 @@ def test_a_fit_goes_to_what_was_told() -> None:
     off = [float(read(field, asked.positions).abs().median()) for field in (without, told)]
     assert off[1] < 0.5 * off[0]
     assert off[1] < 0.3 * spacing(NODES)
+
+
+def test_rounds_go_on_from_where_they_are_told_to() -> None:
+    measured, before = scene(), too_large()
+    torch.testing.assert_close(fit_level(measured, before, RADIUS, 0, LinearConfig()), before)
+    begin = too_large(0.0)
+    torch.testing.assert_close(fit_level(measured, before, RADIUS, 0, LinearConfig(), begin=begin), begin)
 
 
 def test_the_report_says_what_it_was_worth() -> None:
