@@ -30,18 +30,19 @@ from .stereo_windows import neighbours
 
 _PLAIN = 0.5
 """Where patches agree on a larger share of the subject's pixels, what is left is hidden or beside edges."""
-_PARTNERS = 4
+_PARTNERS = 2
 """Photographs that each one is compared with, at most."""
 _SHARE = 0.5
 """Of the photographs' size at which brightness is looked at."""
 _BLUR_PX = 1.0
 """There; noise is averaged, shading is left."""
 _MARGIN_PX = 3
-"""From what misses the field, across which the blur would reach."""
+"""From where the field is missed or turns away: across that the blur would reach, and beside it is what one
+photograph sees and the other does not."""
 _WINDOW_PX = 1
 """Half a window's side."""
 _LEAST_COSINE = 0.25
-"""Between the normal and a ray: what turns away further is seen too foreshortened, or is a bridge."""
+"""Between the normal and a ray: what turns away further is an edge, or a bridge between two parts."""
 _SAME_CELLS = 2.5
 """Two photographs see the same place if their depths of it differ by at most that."""
 _LONGEST_CELLS = 4.0
@@ -109,7 +110,7 @@ class _Picture:
     brightness: Float[Tensor, "height width"]
     """Linear light."""
     depth: Float[Tensor, "height width"]
-    """Of the field, along the axis; 0 where it is missed or the blur reaches across its edge."""
+    """Of the field, along the axis; 0 where it is missed, and near where it turns away."""
     pixel: Int64[Tensor, "places"]
     """Number of the pixel, row by row."""
     positions: Float[Tensor, "places 3"]
@@ -147,30 +148,32 @@ def _picture(scene: Measurements, index: int, distance: Float[Tensor, "nodes nod
     whole, subject, device = scene.cameras[index], scene.certain[index], distance.device
     camera = whole.scaled(max(round(_SHARE * whole.width), 1), max(round(_SHARE * whole.height), 1))
     size = (camera.height, camera.width)
-    asked = (
-        torch.ones(size, dtype=torch.bool, device=device) if subject is None else _at_size(subject, size) < 0
-    )
+    asked = torch.ones(size, dtype=torch.bool, device=device)
+    if subject is not None:
+        asked = _at_size(subject, size) < 0
     along_axis = ray_directions(camera, pixel_centres(camera.width, camera.height, device)[asked])
     directions = F.normalize(along_axis, dim=-1)
     origins = camera.position.expand_as(directions)
     crossing = grid_crossing(distance, origins, directions, grid_entry(origins, directions))
     depth = torch.zeros(size, device=device)
     depth[asked] = torch.where(crossing.hit, crossing.along / along_axis.norm(dim=-1), 0.0)
-    seen = depth > 0
-    inner = torch.tensor(binary_erosion(seen.cpu().numpy(), iterations=_MARGIN_PX), device=device)
     positions = origins + crossing.along[:, None] * directions
     _, gradient = value_and_gradient(distance, locate(positions, len(distance)))
     normals = F.normalize(gradient, dim=-1)
-    wanted = inner[asked] & (-(normals * directions).sum(dim=-1) > _LEAST_COSINE)
+    facing = torch.zeros_like(asked)
+    facing[asked] = crossing.hit & (-(normals * directions).sum(dim=-1) > _LEAST_COSINE)
+    inner = torch.tensor(binary_erosion(facing.cpu().numpy(), iterations=_MARGIN_PX), device=device)
+    wanted = inner[asked]
+    sure = _at_size(scene.confidences[index], size) > SURE
     return _Picture(
         camera=camera,
-        brightness=_brightness(scene.images[index], seen),
+        brightness=_brightness(scene.images[index], depth > 0),
         depth=torch.where(inner, depth, 0.0),
         pixel=torch.nonzero(asked.flatten())[wanted, 0],
         positions=positions[wanted],
         normals=normals[wanted],
         directions=directions[wanted],
-        sure=(_at_size(scene.confidences[index], size) > SURE)[asked][wanted],
+        sure=sure[asked][wanted],
     )
 
 
@@ -201,20 +204,20 @@ def _compared(one: _Picture, other: _Picture, nodes: int) -> _Compared | None:
     positions, normals, directions = one.positions[same], one.normals[same], one.directions[same]
     pixel, sure = one.pixel[same], one.sure[same]
 
-    def shown(along: float) -> Float[Tensor, "places"]:
-        pixels, _ = project(other.camera, positions + along * directions)
+    def shown_at(places: Float[Tensor, "places 3"]) -> Float[Tensor, "places"]:
+        pixels, _ = project(other.camera, places)
         return sample_image(other.brightness[None], pixels[None, None])[0, 0, 0]
 
     def in_picture(values: Float[Tensor, "places"]) -> Float[Tensor, "height width"]:
         return torch.zeros_like(one.brightness).flatten().index_put_((pixel,), values).view_as(one.brightness)
 
-    here, there = one.brightness.flatten()[pixel], shown(0.0)
+    here, there = one.brightness.flatten()[pixel], shown_at(positions)
     difference = here * exposure_ratio(here[sure], there[sure]) - there
     _, box = torch.unique(torch.floor(positions[sure] / (_CELL * h)), dim=0, return_inverse=True)
     differences = means_of_cells(difference[sure], box, _FEWEST_IN_BOX)
     if not len(differences):
         return None
-    along = slopes_along(shown(-h), there, shown(h), h)
+    along = slopes_along(shown_at(positions - h * directions), there, shown_at(positions + h * directions), h)
     known = in_picture(along.straight.float()) > 0
     steps = depth_steps(in_picture(difference), in_picture(along.slope), known, _WINDOW_PX)
     step, slope, left_over = (x.flatten()[pixel] for x in (steps.step, steps.slope, steps.left_over))
