@@ -1,7 +1,7 @@
 """The linear part of the fit: the smoothest field that agrees with points, silhouettes and free space."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float
@@ -19,6 +19,11 @@ from .shared_brightness import ShownPlaces
 from .silhouettes import SilhouetteRays, inside_along, least_distance, middles, silhouette_rays
 from .unseen_side import ball_behind, depth_is_bounded
 
+OrientedPoints = tuple[Float[Tensor, "points 3"], Float[Tensor, "points 3"], Float[Tensor, "points"]]
+"""Positions, normals and weights."""
+Ask = Callable[[Float[Tensor, "nodes nodes nodes"]], ShownPlaces | None]
+"""What brightness tells about a field; None to end the fit."""
+_ROUNDS_AFTER = 1
 _FADE = 0.7
 """Share of its pull that a missed ray keeps in the next round: rays that are hit by then let go."""
 _RIM_REACH = 0.2
@@ -62,6 +67,10 @@ def start(scene: Measurements, radius: float, nodes: int) -> Float[Tensor, "node
     return torch.maximum(ball_behind(scene, radius, nodes), least_distance(scene, nodes))
 
 
+def ask_nothing(distance: Float[Tensor, "nodes nodes nodes"]) -> None:
+    """Nothing is told about any field."""
+
+
 def fit_level(
     scene: Measurements,
     before: Float[Tensor, "nodes nodes nodes"],
@@ -69,28 +78,20 @@ def fit_level(
     rounds: int,
     config: LinearConfig,
     far: Sequence[FarSide] = (),
-    shown: ShownPlaces | None = None,
-    begin: Float[Tensor, "nodes nodes nodes"] | None = None,
+    ask: Ask = ask_nothing,
 ) -> Float[Tensor, "nodes nodes nodes"]:
     """The smoothest field near the points' planes that silhouettes allow, else like the level before.
 
     Smooth is measured against the ball behind, whose curvature is free. Free space (f > 0) and silhouettes
     (f < 0 somewhere on each ray) are inequalities: they pull only where the field says otherwise, which
     takes a few rounds; `rounds` at most, fewer where the surface comes to rest. What is before `far` sides is
-    free as what is before measured depth. Places `shown` by brightness are points as well. With `begin`, a
-    field of the same grid, the rounds go on from there.
+    free as what is before measured depth. When it is done, `ask` is told the field: as long as it answers
+    with places, these are points as well, in place of those it answered before, and there is one more round.
     """
     nodes = before.shape[0]
     h = spacing(nodes)
-    sure = scene.confidence**config.confidence_power
-    positions, normals = scene.positions, scene.normals
-    if shown is not None:
-        positions = torch.cat([positions, shown.positions])
-        normals = torch.cat([normals, shown.normals])
-        sure = torch.cat([sure, config.brightness * shown.weights])
-    points = merged_points(positions, normals, sure, h / 2, correlated=config.correlated)
-    measured = point_distances(*points, nodes, spread_cells=config.spread_cells)
-    measured_weight = measured.weight.clamp(max=4.0)
+    points = _points(scene, config, h / 2)
+    measured = _near_nodes(points, nodes, config)
     ball = ball_behind(scene, radius, nodes)
     bound = least_distance(scene, nodes)
     free = bound > 0
@@ -100,8 +101,8 @@ def fit_level(
     through_subject, pulled = silhouette_rays(scene, nodes), torch.zeros((nodes**3, 2), device=before.device)
     met_along = torch.full_like(through_subject.entry, torch.inf)
     rays, nearest = rim_rays(scene, nodes), nearest_tree(points[0].cpu().numpy())
-    distance = before if begin is None else begin
-    for _ in range(rounds):
+    distance, left = before, rounds
+    while left:
         target, weight = before.clone(), torch.full_like(before, config.prior * (32 / nodes) ** 2)
         carved = free & (distance < bound)
         target[carved], weight[carved] = bound[carved], config.free_space
@@ -114,16 +115,36 @@ def fit_level(
         inside = depths / rays_near.clamp(min=1e-6)
         rims = _rim_distances(scene, rays, distance, nearest, config.rims)
         rim_weight = rims.weight.clamp(max=2.0)
-        total = weight + measured_weight + pull + rim_weight
-        target = weight * target + measured_weight * measured.distance
+        total = weight + measured.weight + pull + rim_weight
+        target = weight * target + measured.weight * measured.distance
         target += rim_weight * rims.distance - pull * inside
         last = distance
         distance = ball + fit_smooth(
             target / total - ball, total, last - ball, smoothness=config.smoothness, steps=30
         )
-        if _movement(last, distance) < config.settled * h:
-            break
+        left = 0 if _movement(last, distance) < config.settled * h else left - 1
+        if not left and (shown := ask(distance)) is not None:
+            measured = _near_nodes(_points(scene, config, h / 2, shown), nodes, config)
+            left = _ROUNDS_AFTER
     return distance
+
+
+def _points(
+    scene: Measurements, config: LinearConfig, cell: float, shown: ShownPlaces | None = None
+) -> OrientedPoints:
+    """What stereo measured and what brightness tells, merged in cubes."""
+    positions, normals = scene.positions, scene.normals
+    sure = scene.confidence**config.confidence_power
+    if shown is not None:
+        positions = torch.cat([positions, shown.positions])
+        normals = torch.cat([normals, shown.normals])
+        sure = torch.cat([sure, config.brightness * shown.weights])
+    return merged_points(positions, normals, sure, cell, correlated=config.correlated)
+
+
+def _near_nodes(points: OrientedPoints, nodes: int, config: LinearConfig) -> PointDistances:
+    measured = point_distances(*points, nodes, spread_cells=config.spread_cells)
+    return replace(measured, weight=measured.weight.clamp(max=4.0))
 
 
 def _movement(

@@ -39,6 +39,8 @@ _BLUR_PX = 1.0
 _MARGIN_PX = 3
 """From where the field is missed or turns away: across that the blur would reach, and beside it is what one
 photograph sees and the other does not."""
+_OUTLINE_PX = 4.0
+"""From the subject's outline in any of the photographs."""
 _WINDOW_PX = 1
 """Half a window's side."""
 _LEAST_COSINE = 0.25
@@ -86,7 +88,7 @@ def shared_brightness(scene: Measurements, distance: Float[Tensor, "nodes nodes 
     differences = torch.cat([pair.differences for pair in compared])
     # a normal law's standard deviation by the median
     by_view = max(1.4826 * float(differences.abs().median()), _LEAST_DIFFERENCE)
-    return _together([_told(pair, by_view) for pair in compared])
+    return _off_outlines(scene, _together([_told(pair, by_view) for pair in compared]))
 
 
 def decision(shown: Sequence[ShownPlaces]) -> Decision:
@@ -239,6 +241,18 @@ def _told(pair: _Compared, by_view: float) -> ShownPlaces:
         positions=pair.positions[kept],
         normals=pair.normals[kept],
         weights=(_SURE_DEVIATION / deviation[kept]).square().clamp(max=1.0),
+    )
+
+
+def _off_outlines(scene: Measurements, shown: ShownPlaces) -> ShownPlaces:
+    """Those that no photograph shows at the subject's outline, which says better where they are."""
+    kept = torch.ones_like(shown.weights, dtype=torch.bool)
+    for camera, outline in zip(scene.cameras, scene.certain, strict=True):
+        if outline is not None:
+            pixels, _ = project(camera, shown.positions)
+            kept &= sample_image(outline[None], pixels[None, None])[0, 0, 0] < -_OUTLINE_PX
+    return ShownPlaces(
+        positions=shown.positions[kept], normals=shown.normals[kept], weights=shown.weights[kept]
     )
 
 

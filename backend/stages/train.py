@@ -17,7 +17,7 @@ from ..maths.grid import refined, spacing
 from ..scene import Decision, Progress, Region, StereoResult, View, within
 from .deadline import Clock, Deadline, GridCost, deadline_after, finest_grid, predicted_s
 from .inner_outlines import FarSide, decision, far_sides
-from .linear_fit import LinearConfig, fit_level, start
+from .linear_fit import Ask, LinearConfig, ask_nothing, fit_level, start
 from .measurements import Measurements, carried, measurements
 from .render_fit import RenderConfig, refine
 from .safe_steps import not_finite
@@ -26,7 +26,7 @@ from .shared_brightness import decision as of_brightness
 from .surface import COARSEST, ShowSurface, Surface, show_nothing, tight_frame
 from .unseen_depth import depth_behind
 
-_PASSES = 2
+_LOOKS = 2
 """How often photographs' brightness is asked on the finest grid, each time from the field so far."""
 
 
@@ -91,13 +91,9 @@ def fit_surface(
             is_second = config.linear.inner_outlines and len(costs) == 2
             far = far_sides(scene, distance) if is_second else []
             told += far
-            before = refined(distance, nodes)
-            distance = fit_level(scene, before, radius, rounds, config.linear, far)
-            if nodes == config.levels[-1]:
-                least_s = clock() - began_s
-                distance, shown = _by_brightness(
-                    scene, before, distance, radius, far, config.linear, deadline, least_s
-                )
+            is_last = config.linear.brightness > 0 and nodes == config.levels[-1]
+            ask = _asking(scene, shown, deadline, began_s) if is_last else ask_nothing
+            distance = fit_level(scene, refined(distance, nodes), radius, rounds, config.linear, far, ask)
         done += 10
         show(Surface(distance=distance.cpu().numpy(), grid_from_world=frame.object_from_world))
         costs.append(GridCost(nodes=nodes, seconds=clock() - began_s))
@@ -116,27 +112,17 @@ def fit_surface(
     return Surface(distance=distance.cpu().numpy(), grid_from_world=frame.object_from_world, decisions=made)
 
 
-def _by_brightness(
-    scene: Measurements,
-    before: Float[Tensor, "nodes nodes nodes"],
-    distance: Float[Tensor, "nodes nodes nodes"],
-    radius: float,
-    far: Sequence[FarSide],
-    config: LinearConfig,
-    deadline: Deadline,
-    least_s: float,
-) -> tuple[Float[Tensor, "nodes nodes nodes"], list[ShownPlaces]]:
-    """The field of a level, fitted on to what brightness tells, and what that was in each pass.
+def _asking(scene: Measurements, shown: list[ShownPlaces], deadline: Deadline, began_s: float) -> Ask:
+    """Asks brightness, a few times while there is time, and keeps what it answers in `shown`."""
 
-    A pass does less than the level's fit did: where not even the time for that is left, it is left out.
-    """
-    shown: list[ShownPlaces] = []
-    while config.brightness and len(shown) < _PASSES and deadline.left_s() > least_s:
+    def ask(distance: Float[Tensor, "nodes nodes nodes"]) -> ShownPlaces | None:
+        # a look and a round take less than the fit did until here
+        if len(shown) == _LOOKS or deadline.left_s() < deadline.clock() - began_s:
+            return None
         shown.append(shared_brightness(scene, distance))
-        if not len(shown[-1].weights):
-            break
-        distance = fit_level(scene, before, radius, 1, config, far, shown[-1], distance)
-    return distance, shown
+        return shown[-1] if len(shown[-1].weights) else None
+
+    return ask
 
 
 def _of_budget(

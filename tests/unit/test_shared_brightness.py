@@ -11,7 +11,7 @@ from torch import Tensor
 
 from backend.maths.geometry import Pinhole, pixel_centres, ray_directions, unproject
 from backend.maths.grid import node_positions, read, spacing
-from backend.stages.linear_fit import LinearConfig, fit_level
+from backend.stages.linear_fit import LinearConfig, ask_nothing, fit_level
 from backend.stages.measurements import Measurements
 from backend.stages.shared_brightness import ShownPlaces, decision, shared_brightness
 
@@ -136,23 +136,24 @@ def test_nothing_is_told_of_an_even_brightness() -> None:
 def test_a_fit_goes_to_what_was_told() -> None:
     measured, before = scene(), too_large()
     shown = shared_brightness(measured, before)
-    asked = ShownPlaces(
-        positions=shown.positions[shown.positions[:, 1] > 0.1],
-        normals=shown.normals[shown.positions[:, 1] > 0.1],
-        weights=shown.weights[shown.positions[:, 1] > 0.1],
+    above = shown.positions[:, 1] > 0.1
+    told = ShownPlaces(
+        positions=shown.positions[above], normals=shown.normals[above], weights=shown.weights[above]
     )
-    without = fit_level(measured, before, RADIUS, 3, LinearConfig())
-    told = fit_level(measured, before, RADIUS, 3, LinearConfig(), shown=asked, begin=without)
-    off = [float(read(field, asked.positions).abs().median()) for field in (without, told)]
+    answers = [told, told, None]
+    fields = [
+        fit_level(measured, before, RADIUS, 3, LinearConfig(), ask=ask)
+        for ask in (ask_nothing, lambda distance: answers.pop(0))
+    ]
+    assert not answers
+    off = [float(read(field, told.positions).abs().median()) for field in fields]
     assert off[1] < 0.5 * off[0]
     assert off[1] < 0.3 * spacing(NODES)
 
 
-def test_rounds_go_on_from_where_they_are_told_to() -> None:
-    measured, before = scene(), too_large()
-    torch.testing.assert_close(fit_level(measured, before, RADIUS, 0, LinearConfig()), before)
-    begin = too_large(0.0)
-    torch.testing.assert_close(fit_level(measured, before, RADIUS, 0, LinearConfig(), begin=begin), begin)
+def test_brightness_is_asked_about_the_field_so_far() -> None:
+    measured, before, asked = scene(), too_large(), list[Field]()
+    assert fit_level(measured, before, RADIUS, 3, LinearConfig(), ask=asked.append) is asked[0]
 
 
 def test_the_report_says_what_it_was_worth() -> None:
