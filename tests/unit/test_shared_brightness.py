@@ -9,7 +9,7 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
-from backend.maths.geometry import Pinhole, pixel_centres, ray_directions, unproject
+from backend.maths.geometry import Pinhole, pixel_centres, project, ray_directions, unproject
 from backend.maths.grid import node_positions, read, spacing
 from backend.stages.linear_fit import LinearConfig, ask_nothing, fit_level
 from backend.stages.measurements import Measurements
@@ -131,6 +131,25 @@ def test_nothing_is_told_of_an_even_brightness() -> None:
     measured = scene()
     even = replace(measured, images=[torch.full_like(image, 0.5) for image in measured.images])
     assert len(shared_brightness(even, too_large()).weights) == 0
+
+
+def test_what_is_at_an_outline_is_left_to_the_outline() -> None:
+    """The outline of a third photograph that shows a part of the ball alone."""
+    measured = scene()
+    everything = shared_brightness(measured, too_large())
+    across = pixel_centres(SIZE, SIZE, torch.device("cpu"))[..., 0] - 70
+    third = replace(
+        measured,
+        cameras=[*measured.cameras, camera(-90)],
+        images=[*measured.images, torch.zeros((3, SIZE, SIZE))],
+        certain=[*measured.certain, across],
+        confidences=[*measured.confidences, torch.zeros((SIZE, SIZE))],
+    )
+    told = shared_brightness(third, too_large())
+    pixels, _ = project(camera(-90), told.positions)
+    assert float(pixels[:, 0].max()) < 66.5
+    pixels, _ = project(camera(-90), everything.positions)
+    assert len(told.weights) == pytest.approx(int((pixels[:, 0] < 66).sum()), rel=0.02)
 
 
 def test_a_fit_goes_to_what_was_told() -> None:

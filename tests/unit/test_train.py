@@ -344,3 +344,12 @@ def test_time_enough_changes_nothing_but_the_words() -> None:
     assert ample.distance.tobytes() == unlimited.distance.tobytes()
     assert ample.decisions[:-1] == unlimited.decisions
     assert decision_on(ample, "budget").choice == "all that the preset asks for"
+
+
+def test_the_report_says_why_brightness_was_left_out() -> None:
+    whole, stopped = (
+        decision_on(limited(budget_s, steps=0), "brightness without texture") for budget_s in (None, 0.5)
+    )
+    assert whole.choice == stopped.choice == "left out"
+    assert "patches agree" in whole.because
+    assert "time" in stopped.because
