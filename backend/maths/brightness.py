@@ -66,7 +66,8 @@ def depth_steps(
         return F.avg_pool2d(known[None, None], side, stride=1, padding=radius_px)[0, 0]
 
     share = mean(torch.ones_like(difference))
-    squares, step = mean(slope.square()), mean(slope * difference) / mean(slope.square())
+    squares = mean(slope.square())
+    step = mean(slope * difference) / squares
     left_over = (mean(difference.square()) - step.square() * squares).clamp(min=0)
     return DepthSteps(step=step, slope=(squares / share).sqrt(), left_over=(left_over / share).sqrt())
 

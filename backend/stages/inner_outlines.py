@@ -19,12 +19,11 @@ from jaxtyping import Bool, Float, Float32, Float64
 from scipy.ndimage import binary_erosion, binary_opening, label
 from torch import Tensor
 
-from ..maths.geometry import Pinhole, pixel_centres, ray_directions
-from ..maths.grid import locate, value_and_gradient
+from ..maths.geometry import Pinhole
 from ..maths.random_walk import WalkEnds, walk_ends
 from ..scene import Decision
 from .measurements import Measurements
-from .silhouettes import grid_crossing, grid_entry
+from .seen_field import at_size, seen_field, smaller
 
 _PIXELS = 30_000
 """Of a picture that walks go over, at most: time grows faster than they do."""
@@ -65,12 +64,12 @@ def far_sides(scene: Measurements, distance: Float[Tensor, "nodes nodes nodes"])
     for camera, image, outline, depth, confidence in views:
         if outline is None:
             continue
-        small = _smaller(camera)
+        small = smaller(camera, min(math.sqrt(_PIXELS / (camera.width * camera.height)), 1.0))
         size = (small.height, small.width)
-        seen = _seen(small, _at_size(outline, size) < 0, distance)
+        seen = _seen(small, at_size(outline, small) < 0, distance)
         on = seen.depth > 0
-        sure = _at_size(confidence, size).numpy()
-        measured = _at_size(depth, size).numpy()
+        sure = at_size(confidence, small).cpu().numpy()
+        measured = at_size(depth, small).cpu().numpy()
         is_known = (measured > 0) & (sure > _LEAST_CONFIDENCE)
         picture = F.interpolate(image[None], size=size, mode="area")[0].permute(1, 2, 0).cpu().numpy()
         ends = walk_ends(
@@ -105,34 +104,16 @@ class _Seen:
     """0 where it turns away, 1 where it faces the camera."""
 
 
-def _smaller(camera: Pinhole) -> Pinhole:
-    share = min(math.sqrt(_PIXELS / (camera.width * camera.height)), 1.0)
-    return camera.scaled(max(round(share * camera.width), 1), max(round(share * camera.height), 1))
-
-
-def _at_size(image: Float[Tensor, "height width"], size: tuple[int, int]) -> Float[Tensor, "rows columns"]:
-    return F.interpolate(image[None, None], size=size, mode="nearest-exact")[0, 0].cpu()
-
-
 def _seen(
     camera: Pinhole, where: Bool[Tensor, "height width"], distance: Float[Tensor, "nodes nodes nodes"]
 ) -> _Seen:
-    looked_at = where.to(distance.device)
-    along_axis = ray_directions(
-        camera, pixel_centres(camera.width, camera.height, distance.device)[looked_at]
-    )
-    directions = F.normalize(along_axis, dim=-1)
-    origins = camera.position.expand_as(directions)
-    crossing = grid_crossing(distance, origins, directions, grid_entry(origins, directions))
-    points = origins + crossing.along[:, None] * directions
-    _, gradient = value_and_gradient(distance, locate(points, len(distance)))
-    cosine = -(F.normalize(gradient, dim=-1) * directions).sum(dim=-1)
-    depth = torch.where(crossing.hit, crossing.along / along_axis.norm(dim=-1), 0.0)
-    facing = torch.where(crossing.hit, ((cosine - 0.3) / 0.5).clamp(0, 1).square(), 0.0)
+    seen = seen_field(camera, where, distance)
+    depth = torch.where(seen.hit, seen.depth, 0.0)
+    facing = torch.where(seen.hit, ((seen.cosine - 0.3) / 0.5).clamp(0, 1).square(), 0.0)
 
     def as_picture(values: Float[Tensor, "pixels"]) -> Float64[np.ndarray, "height width"]:
         out = np.zeros(where.shape)
-        out[where.numpy()] = values.cpu().numpy()
+        out[where.cpu().numpy()] = values.cpu().numpy()
         return out
 
     return _Seen(depth=as_picture(depth), facing=as_picture(facing))

@@ -23,7 +23,6 @@ OrientedPoints = tuple[Float[Tensor, "points 3"], Float[Tensor, "points 3"], Flo
 """Positions, normals and weights."""
 Ask = Callable[[Float[Tensor, "nodes nodes nodes"]], ShownPlaces | None]
 """What brightness tells about a field; None to end the fit."""
-_ROUNDS_AFTER = 1
 _FADE = 0.7
 """Share of its pull that a missed ray keeps in the next round: rays that are hit by then let go."""
 _RIM_REACH = 0.2
@@ -125,7 +124,7 @@ def fit_level(
         left = 0 if _movement(last, distance) < config.settled * h else left - 1
         if not left and (shown := ask(distance)) is not None:
             measured = _near_nodes(_points(scene, config, h / 2, shown), nodes, config)
-            left = _ROUNDS_AFTER
+            left = 1
     return distance
 
 

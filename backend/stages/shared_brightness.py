@@ -20,12 +20,12 @@ from scipy.ndimage import binary_erosion, gaussian_filter
 from torch import Tensor
 
 from ..maths.brightness import depth_steps, exposure_ratio, means_of_cells, slopes_along
-from ..maths.geometry import Pinhole, pixel_centres, project, ray_directions, sample_image
-from ..maths.grid import locate, spacing, value_and_gradient
+from ..maths.geometry import Pinhole, project, sample_image
+from ..maths.grid import spacing
 from ..maths.srgb import linear_from_srgb
 from ..scene import Decision
 from .measurements import SURE, Measurements
-from .silhouettes import grid_crossing, grid_entry
+from .seen_field import at_size, seen_field, smaller
 from .stereo_windows import neighbours
 
 _PLAIN = 0.5
@@ -69,6 +69,12 @@ class ShownPlaces:
     normals: Float[Tensor, "points 3"]
     weights: Float[Tensor, "points"]
     """Beside a sure stereo point, 0 to 1."""
+
+    def chosen(self, which: Bool[Tensor, "points"]) -> "ShownPlaces":
+        """Some of them."""
+        return ShownPlaces(
+            positions=self.positions[which], normals=self.normals[which], weights=self.weights[which]
+        )
 
 
 def shared_brightness(scene: Measurements, distance: Float[Tensor, "nodes nodes nodes"]) -> ShownPlaces:
@@ -147,40 +153,26 @@ def _sure_share(scene: Measurements) -> float:
 
 
 def _picture(scene: Measurements, index: int, distance: Float[Tensor, "nodes nodes nodes"]) -> _Picture:
-    whole, subject, device = scene.cameras[index], scene.certain[index], distance.device
-    camera = whole.scaled(max(round(_SHARE * whole.width), 1), max(round(_SHARE * whole.height), 1))
-    size = (camera.height, camera.width)
-    asked = torch.ones(size, dtype=torch.bool, device=device)
+    camera, subject = smaller(scene.cameras[index], _SHARE), scene.certain[index]
+    asked = torch.ones((camera.height, camera.width), dtype=torch.bool, device=distance.device)
     if subject is not None:
-        asked = _at_size(subject, size) < 0
-    along_axis = ray_directions(camera, pixel_centres(camera.width, camera.height, device)[asked])
-    directions = F.normalize(along_axis, dim=-1)
-    origins = camera.position.expand_as(directions)
-    crossing = grid_crossing(distance, origins, directions, grid_entry(origins, directions))
-    depth = torch.zeros(size, device=device)
-    depth[asked] = torch.where(crossing.hit, crossing.along / along_axis.norm(dim=-1), 0.0)
-    positions = origins + crossing.along[:, None] * directions
-    _, gradient = value_and_gradient(distance, locate(positions, len(distance)))
-    normals = F.normalize(gradient, dim=-1)
-    facing = torch.zeros_like(asked)
-    facing[asked] = crossing.hit & (-(normals * directions).sum(dim=-1) > _LEAST_COSINE)
-    inner = torch.tensor(binary_erosion(facing.cpu().numpy(), iterations=_MARGIN_PX), device=device)
+        asked = at_size(subject, camera) < 0
+    seen = seen_field(camera, asked, distance)
+    depth, facing = torch.zeros(asked.shape, device=asked.device), torch.zeros_like(asked)
+    depth[asked] = torch.where(seen.hit, seen.depth, 0.0)
+    facing[asked] = seen.hit & (seen.cosine > _LEAST_COSINE)
+    inner = torch.tensor(binary_erosion(facing.cpu().numpy(), iterations=_MARGIN_PX), device=asked.device)
     wanted = inner[asked]
-    sure = _at_size(scene.confidences[index], size) > SURE
     return _Picture(
         camera=camera,
         brightness=_brightness(scene.images[index], depth > 0),
         depth=torch.where(inner, depth, 0.0),
         pixel=torch.nonzero(asked.flatten())[wanted, 0],
-        positions=positions[wanted],
-        normals=normals[wanted],
-        directions=directions[wanted],
-        sure=sure[asked][wanted],
+        positions=seen.positions[wanted],
+        normals=seen.normals[wanted],
+        directions=seen.directions[wanted],
+        sure=(at_size(scene.confidences[index], camera) > SURE)[asked][wanted],
     )
-
-
-def _at_size(image: Float[Tensor, "height width"], size: tuple[int, int]) -> Float[Tensor, "rows columns"]:
-    return F.interpolate(image[None, None], size=size, mode="nearest-exact")[0, 0]
 
 
 def _brightness(
@@ -236,12 +228,9 @@ def _compared(one: _Picture, other: _Picture, nodes: int) -> _Compared | None:
 def _told(pair: _Compared, by_view: float) -> ShownPlaces:
     """The places that are told well enough, by how much brightness depends on the view."""
     deviation = (pair.left_over.square() + by_view**2).sqrt() / pair.slope
-    kept = deviation < _LARGEST_DEVIATION
-    return ShownPlaces(
-        positions=pair.positions[kept],
-        normals=pair.normals[kept],
-        weights=(_SURE_DEVIATION / deviation[kept]).square().clamp(max=1.0),
-    )
+    weights = (_SURE_DEVIATION / deviation).square().clamp(max=1.0)
+    every = ShownPlaces(positions=pair.positions, normals=pair.normals, weights=weights)
+    return every.chosen(deviation < _LARGEST_DEVIATION)
 
 
 def _off_outlines(scene: Measurements, shown: ShownPlaces) -> ShownPlaces:
@@ -251,9 +240,7 @@ def _off_outlines(scene: Measurements, shown: ShownPlaces) -> ShownPlaces:
         if outline is not None:
             pixels, _ = project(camera, shown.positions)
             kept &= sample_image(outline[None], pixels[None, None])[0, 0, 0] < -_OUTLINE_PX
-    return ShownPlaces(
-        positions=shown.positions[kept], normals=shown.normals[kept], weights=shown.weights[kept]
-    )
+    return shown.chosen(kept)
 
 
 def _together(parts: Sequence[ShownPlaces]) -> ShownPlaces:

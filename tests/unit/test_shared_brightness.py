@@ -11,9 +11,10 @@ from torch import Tensor
 
 from backend.maths.geometry import Pinhole, pixel_centres, project, ray_directions, unproject
 from backend.maths.grid import node_positions, read, spacing
+from backend.maths.srgb import srgb_from_linear
 from backend.stages.linear_fit import LinearConfig, ask_nothing, fit_level
 from backend.stages.measurements import Measurements
-from backend.stages.shared_brightness import ShownPlaces, decision, shared_brightness
+from backend.stages.shared_brightness import decision, shared_brightness
 
 NODES, SIZE, RADIUS = 64, 320, 0.6
 TOO_LARGE = 0.03
@@ -57,7 +58,8 @@ def scene(*, shine: float = 0.0, exposure: float = 1.0, known_up_to: float = 0.0
         to_camera = F.normalize(one.position - points, dim=-1)
         halfway = F.normalize(to_camera + LIGHT, dim=-1)
         light = (matt + shine * (normals * halfway).sum(-1).clamp(min=0) ** 4) * (exposure if index else 1.0)
-        images.append(torch.where(on, _srgb(light.clamp(max=1)), 0.0).expand(3, -1, -1))
+        srgb = torch.tensor(srgb_from_linear(light.clamp(max=1).numpy()), dtype=torch.float32)
+        images.append(torch.where(on, srgb, 0.0).expand(3, -1, -1))
         outlines.append(torch.where(on, -5.0, 5.0))
         known = on & (points[..., 1] < known_up_to)
         depths.append(torch.where(known, depth, 0.0))
@@ -80,11 +82,6 @@ def scene(*, shine: float = 0.0, exposure: float = 1.0, known_up_to: float = 0.0
         region_centre=torch.zeros(3),
         region_radius=1.0,
     )
-
-
-def _srgb(light: Tensor) -> Tensor:
-    """IEC 61966-2-1."""
-    return torch.where(light <= 0.0031308, 12.92 * light, 1.055 * light.clamp(min=1e-4) ** (1 / 2.4) - 0.055)
 
 
 def error(places: Float[Tensor, "points 3"]) -> float:
@@ -155,10 +152,7 @@ def test_what_is_at_an_outline_is_left_to_the_outline() -> None:
 def test_a_fit_goes_to_what_was_told() -> None:
     measured, before = scene(), too_large()
     shown = shared_brightness(measured, before)
-    above = shown.positions[:, 1] > 0.1
-    told = ShownPlaces(
-        positions=shown.positions[above], normals=shown.normals[above], weights=shown.weights[above]
-    )
+    told = shown.chosen(shown.positions[:, 1] > 0.1)
     answers = [told, told, None]
     fields = [
         fit_level(measured, before, RADIUS, 3, LinearConfig(), ask=ask)
