@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, Int64
 from torch import Tensor
 
 from .geometry import Pinhole, inside, sample_image
@@ -83,13 +83,9 @@ def merged_points(
     """
     if not len(positions):
         return positions, normals, confidence
-    place = (positions / cell).floor().long()
-    place -= place.amin(dim=0)
     axis = normals.abs().argmax(dim=-1)
     side = 2 * axis + (normals.gather(-1, axis[:, None])[:, 0] > 0)
-    size = place.amax(dim=0) + 1
-    key = ((place[:, 0] * size[1] + place[:, 1]) * size[2] + place[:, 2]) * 6 + side
-    cubes, cube_of = torch.unique(key, return_inverse=True)
+    cubes, cube_of = torch.unique(cube_keys(positions, cell) * 6 + side, return_inverse=True)
     one = torch.ones_like(confidence)
     weighted = torch.column_stack([positions, normals, one, confidence]) * confidence[:, None]
     sums = positions.new_zeros((len(cubes), 8)).index_add_(0, cube_of, weighted)
@@ -100,6 +96,14 @@ def merged_points(
         F.normalize(kept[:, 3:6], dim=-1),
         kept[:, 7] / total if correlated else total,
     )
+
+
+def cube_keys(positions: Float[Tensor, "points 3"], cell: float) -> Int64[Tensor, "points"]:
+    """Of the cube, of side `cell`, that each of at least one point lies in: the same number for the same cube."""
+    place = (positions / cell).floor().long()
+    place -= place.amin(dim=0)
+    size = place.amax(dim=0) + 1
+    return (place[:, 0] * size[1] + place[:, 1]) * size[2] + place[:, 2]
 
 
 def half_cell_px(camera: Pinhole, nodes: int) -> int:

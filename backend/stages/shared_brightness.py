@@ -20,6 +20,7 @@ from scipy.ndimage import binary_erosion, gaussian_filter
 from torch import Tensor
 
 from ..maths.brightness import depth_steps, exposure_ratio, means_of_cells, slopes_along
+from ..maths.evidence import cube_keys
 from ..maths.geometry import Pinhole, project, sample_image
 from ..maths.grid import spacing
 from ..maths.srgb import linear_from_srgb
@@ -197,6 +198,8 @@ def _compared(one: _Picture, other: _Picture, nodes: int) -> _Compared | None:
     same &= (one.normals * towards).sum(dim=-1) > _LEAST_COSINE
     positions, normals, directions = one.positions[same], one.normals[same], one.directions[same]
     pixel, sure = one.pixel[same], one.sure[same]
+    if not sure.any():
+        return None
 
     def shown_at(places: Float[Tensor, "places 3"]) -> Float[Tensor, "places"]:
         pixels, _ = project(other.camera, places)
@@ -207,7 +210,7 @@ def _compared(one: _Picture, other: _Picture, nodes: int) -> _Compared | None:
 
     here, there = one.brightness.flatten()[pixel], shown_at(positions)
     difference = here * exposure_ratio(here[sure], there[sure]) - there
-    _, box = torch.unique(torch.floor(positions[sure] / (_CELL * h)), dim=0, return_inverse=True)
+    _, box = torch.unique(cube_keys(positions[sure], _CELL * h), return_inverse=True)
     differences = means_of_cells(difference[sure], box, _FEWEST_IN_BOX)
     if not len(differences):
         return None
