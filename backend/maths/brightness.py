@@ -1,9 +1,14 @@
-"""Where a surface should be so that two photographs are equally bright: a first-order step along rays.
+"""Where a surface should be so that two photographs show the same colour: a first-order step along rays.
 
 A matt surface is as bright from every side, also where it shows no texture that patches could be compared by.
 Its shading changes from place to place; so along the ray of one photograph the brightness that another one
 shows changes as well, and the depth at which both agree solves one linear equation (Lucas and Kanade, "An
 Iterative Image Registration Technique", IJCAI 1981, with depth as the one unknown).
+
+What shines is not as bright from every side, and its highlights, mirrored by a convex surface, look as if
+they lay behind it. But a highlight has the colour of the light: it changes brightness and hardly the
+differences between red, green and blue (as in Mallick et al., "Beyond Lambert", CVPR 2005). So brightness and
+differences are channels of their own, each in units of its own noise.
 """
 
 from dataclasses import dataclass
@@ -30,14 +35,21 @@ class Slopes:
 
 @dataclass(frozen=True, kw_only=True)
 class DepthSteps:
-    """To where brightness agrees, by all pixels of a small window."""
+    """To where channels agree, by all pixels of a small window."""
 
     step: Float[Tensor, "height width"]
     """Along the ray, > 0 away from the camera; not finite where nothing in the window changes."""
     slope: Float[Tensor, "height width"]
-    """Of brightness along the ray, root mean square over the window."""
+    """Along the ray: the root of the channels' sum of mean squares over the window."""
     left_over: Float[Tensor, "height width"]
-    """Difference of brightness that the step does not explain, root mean square over the window."""
+    """Difference that the step does not explain, root mean square over the window; each channel counts by its
+    share in the squared slope."""
+
+
+def channels_of(linear: Float[Tensor, "3 *places"]) -> Float[Tensor, "3 *places"]:
+    """Brightness, and how much more red and green there is, in linear light, than what would be grey."""
+    red, green, blue = linear
+    return torch.stack([linear.mean(dim=0), red - blue, green - (red + blue) / 2])
 
 
 def slopes_along(
@@ -49,38 +61,49 @@ def slopes_along(
 
 
 def depth_steps(
-    difference: Float[Tensor, "height width"],
-    slope: Float[Tensor, "height width"],
-    where: Bool[Tensor, "height width"],
+    difference: Float[Tensor, "channels height width"],
+    slope: Float[Tensor, "channels height width"],
+    where: Bool[Tensor, "channels height width"],
     radius_px: int,
 ) -> DepthSteps:
     """The steps s with the least sum of (difference - slope s)^2 over each window, `where` both are known.
 
-    `difference` is the brightness in the photograph that the rays are of, less what another shows of the
-    same places.
+    `difference` is what the photograph that the rays are of shows, less what another shows of the same
+    places; it and the slope are in units of the channel's noise.
     """
     side = 2 * radius_px + 1
 
-    def mean(values: Float[Tensor, "height width"]) -> Float[Tensor, "height width"]:
+    def mean(values: Float[Tensor, "channels height width"]) -> Float[Tensor, "channels height width"]:
         known = torch.where(where, values, 0.0)
-        return F.avg_pool2d(known[None, None], side, stride=1, padding=radius_px)[0, 0]
+        return F.avg_pool2d(known[None], side, stride=1, padding=radius_px)[0]
 
     share = mean(torch.ones_like(difference))
-    squares = mean(slope.square())
-    step = mean(slope * difference) / squares
-    left_over = (mean(difference.square()) - step.square() * squares).clamp(min=0)
-    return DepthSteps(step=step, slope=(squares / share).sqrt(), left_over=(left_over / share).sqrt())
+    squares = mean(slope.square()) / share.clamp(min=1e-6)
+    products = mean(slope * difference) / share.clamp(min=1e-6)
+    step = products.sum(dim=0) / squares.sum(dim=0)
+    off = mean(difference.square()) / share.clamp(min=1e-6) - 2 * step * products + step.square() * squares
+    left_over = (squares * off.clamp(min=0)).sum(dim=0) / squares.sum(dim=0)
+    return DepthSteps(step=step, slope=squares.sum(dim=0).sqrt(), left_over=left_over.sqrt())
 
 
-def exposure_ratio(here: Float[Tensor, "places"], there: Float[Tensor, "places"]) -> Float[Tensor, ""]:
-    """How many times brighter `there` is than `here`: the median of the places' ratios."""
-    return (there / here.clamp(min=torch.finfo(here.dtype).tiny)).median()
+def exposure_ratio(
+    here: Float[Tensor, "channels places"], there: Float[Tensor, "channels places"]
+) -> Float[Tensor, "channels"]:
+    """How many times more `there` is than `here`: the r with the least sum of |there - r here|.
+
+    That is the median of the places' ratios, in which each weighs as much as there is `here`.
+    """
+    weight = here.abs()
+    ratio, order = torch.where(weight > 0, there / here, 0.0).sort(dim=-1)
+    weights_up_to = weight.gather(-1, order).cumsum(dim=-1)
+    middle = (weights_up_to < weights_up_to[:, -1:] / 2).sum(dim=-1)
+    return ratio.gather(-1, middle[:, None])[:, 0]
 
 
 def means_of_cells(
-    values: Float[Tensor, "places"], cell: Int64[Tensor, "places"], fewest: int
-) -> Float[Tensor, "cells"]:
+    values: Float[Tensor, "channels places"], cell: Int64[Tensor, "places"], fewest: int
+) -> Float[Tensor, "channels cells"]:
     """Over the places of each cell (numbered from 0) that holds at least so many."""
     count = torch.bincount(cell)
-    sums = torch.zeros_like(count, dtype=values.dtype).index_add_(0, cell, values)
-    return (sums / count.clamp(min=1))[count >= fewest]
+    sums = values.new_zeros((len(values), len(count))).index_add_(1, cell, values)
+    return (sums / count.clamp(min=1))[:, count >= fewest]

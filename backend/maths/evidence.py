@@ -99,7 +99,7 @@ def merged_points(
 
 
 def cube_keys(positions: Float[Tensor, "points 3"], cell: float) -> Int64[Tensor, "points"]:
-    """Of the cube, of side `cell`, that each of at least one point lies in: the same number for the same cube."""
+    """A number for the cube, of side `cell`, that a point lies in; of at least one point."""
     place = (positions / cell).floor().long()
     place -= place.amin(dim=0)
     size = place.amax(dim=0) + 1

@@ -13,13 +13,21 @@ it); and by what one step leaves unexplained in a window (texture, edges, someth
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 import torch.nn.functional as F
-from jaxtyping import Bool, Float, Int64
+from jaxtyping import Bool, Float, Int64, Shaped
 from scipy.ndimage import binary_erosion, gaussian_filter
 from torch import Tensor
 
-from ..maths.brightness import depth_steps, exposure_ratio, means_of_cells, slopes_along
+from ..maths.brightness import (
+    Slopes,
+    channels_of,
+    depth_steps,
+    exposure_ratio,
+    means_of_cells,
+    slopes_along,
+)
 from ..maths.evidence import cube_keys
 from ..maths.geometry import Pinhole, project, sample_image
 from ..maths.grid import spacing
@@ -44,6 +52,10 @@ _OUTLINE_PX = 4.0
 """From the subject's outline in any of the photographs."""
 _WINDOW_PX = 1
 """Half a window's side."""
+_WIDE_PX = 4
+"""The same of a wider one."""
+_ALIKE_CELLS = 1.0
+"""Both windows' steps differ by at most that: beside a place as bright as can be, the small one's go wild."""
 _LEAST_COSINE = 0.25
 """Between the normal and a ray: what turns away further is an edge, or a bridge between two parts."""
 _SAME_CELLS = 2.5
@@ -92,9 +104,9 @@ def shared_brightness(scene: Measurements, distance: Float[Tensor, "nodes nodes 
     ]
     if not compared:
         return _together([])
-    differences = torch.cat([pair.differences for pair in compared])
+    differences = torch.cat([pair.differences for pair in compared], dim=1)
     # a normal law's standard deviation by the median
-    by_view = max(1.4826 * float(differences.abs().median()), _LEAST_DIFFERENCE)
+    by_view = (1.4826 * differences.abs().median(dim=1).values).clamp(min=_LEAST_DIFFERENCE)
     return _off_outlines(scene, _together([_told(pair, by_view) for pair in compared]))
 
 
@@ -116,10 +128,17 @@ class _Picture:
 
     camera: Pinhole
     """Of a smaller picture."""
-    brightness: Float[Tensor, "height width"]
-    """Linear light."""
+    linear: Float[Tensor, "3 height width"]
+    """Blurred."""
     depth: Float[Tensor, "height width"]
     """Of the field, along the axis; 0 where it is missed, and near where it turns away."""
+    places: "_Places"
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Places:
+    """Of the field, that pixels see."""
+
     pixel: Int64[Tensor, "places"]
     """Number of the pixel, row by row."""
     positions: Float[Tensor, "places 3"]
@@ -129,18 +148,30 @@ class _Picture:
     sure: Bool[Tensor, "places"]
     """Whether patches agree there."""
 
+    def chosen(self, which: Bool[Tensor, "places"]) -> "_Places":
+        """Some of them."""
+        return _Places(
+            pixel=self.pixel[which],
+            positions=self.positions[which],
+            normals=self.normals[which],
+            directions=self.directions[which],
+            sure=self.sure[which],
+        )
+
 
 @dataclass(frozen=True, kw_only=True)
 class _Compared:
-    """What two photographs show of the same places."""
+    """What two photographs show of the same places, by channels: brightness and differences of colour."""
 
-    differences: Float[Tensor, "boxes"]
-    """Of brightness, where patches agree, averaged."""
-    positions: Float[Tensor, "places 3"]
-    """Where brightness agrees, for all other places."""
-    normals: Float[Tensor, "places 3"]
-    slope: Float[Tensor, "places"]
-    left_over: Float[Tensor, "places"]
+    differences: Float[Tensor, "channels boxes"]
+    """Where patches agree, averaged."""
+    places: _Places
+    """Where patches do not."""
+    difference: Float[Tensor, "channels height width"]
+    slopes: Slopes
+    """Of them, [channels, height, width]; straight nowhere but at the places that both show."""
+    cell: float
+    """Side of a cell of the grid."""
 
 
 def _sure_share(scene: Measurements) -> float:
@@ -166,74 +197,83 @@ def _picture(scene: Measurements, index: int, distance: Float[Tensor, "nodes nod
     wanted = inner[asked]
     return _Picture(
         camera=camera,
-        brightness=_brightness(scene.images[index], depth > 0),
+        linear=_blurred(scene.images[index], depth > 0),
         depth=torch.where(inner, depth, 0.0),
-        pixel=torch.nonzero(asked.flatten())[wanted, 0],
-        positions=seen.positions[wanted],
-        normals=seen.normals[wanted],
-        directions=seen.directions[wanted],
-        sure=(at_size(scene.confidences[index], camera) > SURE)[asked][wanted],
+        places=_Places(
+            pixel=torch.nonzero(asked.flatten())[wanted, 0],
+            positions=seen.positions[wanted],
+            normals=seen.normals[wanted],
+            directions=seen.directions[wanted],
+            sure=(at_size(scene.confidences[index], camera) > SURE)[asked][wanted],
+        ),
     )
 
 
-def _brightness(
+def _blurred(
     image_srgb: Float[Tensor, "3 height width"], seen: Bool[Tensor, "rows columns"]
-) -> Float[Tensor, "rows columns"]:
-    """Grey, blurred over the seen pixels alone."""
+) -> Float[Tensor, "3 rows columns"]:
+    """Linear light, blurred over the seen pixels alone."""
     small = F.interpolate(image_srgb[None], size=tuple(seen.shape), mode="area")[0]
-    grey = linear_from_srgb(small.cpu().numpy()).mean(axis=0)
-    on = seen.cpu().numpy().astype(grey.dtype)
-    share = gaussian_filter(on, _BLUR_PX)
-    blurred = gaussian_filter(grey * on, _BLUR_PX) / share.clip(min=1e-6)
+    linear, on = linear_from_srgb(small.cpu().numpy()), seen.cpu().numpy().astype(np.float32)
+    share = gaussian_filter(on, _BLUR_PX).clip(min=1e-6)
+    blurred = np.stack([gaussian_filter(channel * on, _BLUR_PX) / share for channel in linear])
     return torch.tensor(blurred, dtype=torch.float32, device=seen.device)
 
 
 def _compared(one: _Picture, other: _Picture, nodes: int) -> _Compared | None:
     """What another photograph shows of the places of one; None if too little is known to judge it by."""
     h = spacing(nodes)
-    at, depth = project(other.camera, one.positions)
+    at, depth = project(other.camera, one.places.positions)
     seen_depth = sample_image(other.depth[None], at[None, None], "nearest")[0, 0, 0]
-    towards = F.normalize(other.camera.position - one.positions, dim=-1)
+    towards = F.normalize(other.camera.position - one.places.positions, dim=-1)
     same = (depth > 0) & (seen_depth > 0) & ((seen_depth - depth).abs() < _SAME_CELLS * h)
-    same &= (one.normals * towards).sum(dim=-1) > _LEAST_COSINE
-    positions, normals, directions = one.positions[same], one.normals[same], one.directions[same]
-    pixel, sure = one.pixel[same], one.sure[same]
+    same &= (one.places.normals * towards).sum(dim=-1) > _LEAST_COSINE
+    places = one.places.chosen(same)
+    sure = places.sure
     if not sure.any():
         return None
 
-    def shown_at(places: Float[Tensor, "places 3"]) -> Float[Tensor, "places"]:
-        pixels, _ = project(other.camera, places)
-        return sample_image(other.brightness[None], pixels[None, None])[0, 0, 0]
+    def shown(step: float) -> Float[Tensor, "channels places"]:
+        pixels, _ = project(other.camera, places.positions + step * places.directions)
+        return channels_of(sample_image(other.linear, pixels[None, None])[0, :, 0])
 
-    def in_picture(values: Float[Tensor, "places"]) -> Float[Tensor, "height width"]:
-        return torch.zeros_like(one.brightness).flatten().index_put_((pixel,), values).view_as(one.brightness)
+    def in_picture(values: Shaped[Tensor, "channels places"]) -> Shaped[Tensor, "channels height width"]:
+        empty = values.new_zeros((len(values), one.camera.height * one.camera.width))
+        return empty.index_copy_(1, places.pixel, values).view(-1, one.camera.height, one.camera.width)
 
-    here, there = one.brightness.flatten()[pixel], shown_at(positions)
-    difference = here * exposure_ratio(here[sure], there[sure]) - there
-    _, box = torch.unique(cube_keys(positions[sure], _CELL * h), return_inverse=True)
-    differences = means_of_cells(difference[sure], box, _FEWEST_IN_BOX)
-    if not len(differences):
+    here, there = channels_of(one.linear.flatten(1)[:, places.pixel]), shown(0.0)
+    difference = here * exposure_ratio(here[:, sure], there[:, sure])[:, None] - there
+    _, box = torch.unique(cube_keys(places.positions[sure], _CELL * h), return_inverse=True)
+    differences = means_of_cells(difference[:, sure], box, _FEWEST_IN_BOX)
+    if not differences.shape[1]:
         return None
-    along = slopes_along(shown_at(positions - h * directions), there, shown_at(positions + h * directions), h)
-    known = in_picture(along.straight.float()) > 0
-    steps = depth_steps(in_picture(difference), in_picture(along.slope), known, _WINDOW_PX)
-    step, slope, left_over = (x.flatten()[pixel] for x in (steps.step, steps.slope, steps.left_over))
-    told = along.straight & ~sure & (step.abs() < _LONGEST_CELLS * h)
+    along = slopes_along(shown(-h), there, shown(h), h)
     return _Compared(
         differences=differences,
-        positions=positions[told] + step[told, None] * directions[told],
-        normals=normals[told],
-        slope=slope[told],
-        left_over=left_over[told],
+        places=places.chosen(~sure),
+        difference=in_picture(difference),
+        slopes=Slopes(slope=in_picture(along.slope), straight=in_picture(along.straight)),
+        cell=h,
     )
 
 
-def _told(pair: _Compared, by_view: float) -> ShownPlaces:
-    """The places that are told well enough, by how much brightness depends on the view."""
-    deviation = (pair.left_over.square() + by_view**2).sqrt() / pair.slope
-    weights = (_SURE_DEVIATION / deviation).square().clamp(max=1.0)
-    every = ShownPlaces(positions=pair.positions, normals=pair.normals, weights=weights)
-    return every.chosen(deviation < _LARGEST_DEVIATION)
+def _told(pair: _Compared, by_view: Float[Tensor, "channels"]) -> ShownPlaces:
+    """The places that are told well enough, by how much each channel depends on the view."""
+    noise, straight = by_view[:, None, None], pair.slopes.straight
+    difference, slope = pair.difference / noise, pair.slopes.slope / noise
+    steps = depth_steps(difference, slope, straight, _WINDOW_PX)
+    around = depth_steps(difference, slope, straight, _WIDE_PX)
+    deviation = (steps.left_over.square() + 1).sqrt() / steps.slope
+    asked = straight.any(dim=0) & (deviation < _LARGEST_DEVIATION)
+    asked &= steps.step.abs() < _LONGEST_CELLS * pair.cell
+    asked &= (steps.step - around.step).abs() < _ALIKE_CELLS * pair.cell
+    places = pair.places.chosen(asked.flatten()[pair.places.pixel])
+    step, deviation = steps.step.flatten()[places.pixel], deviation.flatten()[places.pixel]
+    return ShownPlaces(
+        positions=places.positions + step[:, None] * places.directions,
+        normals=places.normals,
+        weights=(_SURE_DEVIATION / deviation).square().clamp(max=1.0),
+    )
 
 
 def _off_outlines(scene: Measurements, shown: ShownPlaces) -> ShownPlaces:

@@ -1,11 +1,11 @@
-"""The first-order step to where two photographs are equally bright: closed forms and laws."""
+"""The first-order step to where two photographs show the same: closed forms and laws."""
 
 import pytest
 import torch
 
-from backend.maths.brightness import depth_steps, exposure_ratio, means_of_cells, slopes_along
+from backend.maths.brightness import channels_of, depth_steps, exposure_ratio, means_of_cells, slopes_along
 
-EVERYWHERE = torch.ones((9, 11), dtype=torch.bool)
+EVERYWHERE = torch.ones((2, 9, 11), dtype=torch.bool)
 
 
 def test_even_change_is_straight_and_its_slope_exact() -> None:
@@ -26,8 +26,16 @@ def test_what_does_not_change_has_no_slope_to_go_by() -> None:
     assert not bool(slopes_along(same, same, same, 0.1).straight)
 
 
+def test_a_highlight_of_the_light_s_colour_changes_brightness_alone() -> None:
+    matt = torch.tensor([[0.6], [0.3], [0.1]])
+    one, other = channels_of(matt), channels_of(matt + 0.2)
+    assert float(other[0] - one[0]) == pytest.approx(0.2)
+    torch.testing.assert_close(other[1:], one[1:])
+    torch.testing.assert_close(channels_of(2 * matt), 2 * one)  # shading changes all
+
+
 def test_a_linear_difference_is_solved_exactly() -> None:
-    slope = torch.rand((9, 11), generator=torch.Generator().manual_seed(0)) + 0.5
+    slope = torch.rand((2, 9, 11), generator=torch.Generator().manual_seed(0)) + 0.5
     found = depth_steps(0.03 * slope, slope, EVERYWHERE, 1)
     torch.testing.assert_close(found.step, torch.full((9, 11), 0.03))
     assert float(found.left_over.max()) < 1e-4  # what float32 leaves of squares of 0.03
@@ -35,11 +43,11 @@ def test_a_linear_difference_is_solved_exactly() -> None:
 
 def test_the_step_is_that_of_least_squares_over_each_window() -> None:
     generator = torch.Generator().manual_seed(1)
-    slope, difference = (torch.randn((9, 11), generator=generator) for _ in range(2))
-    where = torch.rand((9, 11), generator=generator) < 0.7
+    slope, difference = (torch.randn((1, 9, 11), generator=generator) for _ in range(2))
+    where = torch.rand((1, 9, 11), generator=generator) < 0.7
     found = depth_steps(difference, slope, where, 1)
     for row, column in ((0, 0), (4, 5), (8, 3)):
-        window = (slice(max(row - 1, 0), row + 2), slice(max(column - 1, 0), column + 2))
+        window = (0, slice(max(row - 1, 0), row + 2), slice(max(column - 1, 0), column + 2))
         a, b = slope[window][where[window]], difference[window][where[window]]
         solved = torch.linalg.lstsq(a[:, None].double(), b[:, None].double()).solution[0, 0]
         torch.testing.assert_close(found.step[row, column].double(), solved, rtol=1e-4, atol=1e-5)
@@ -49,24 +57,39 @@ def test_the_step_is_that_of_least_squares_over_each_window() -> None:
         torch.testing.assert_close(found.slope[row, column], a.square().mean().sqrt())
 
 
+def test_channels_count_by_what_they_say() -> None:
+    """Each as its mean square slope; one without slope neither moves the step nor is asked what is left."""
+    slope = torch.tensor([3.0, 1.0, 0.0])[:, None, None].expand(3, 9, 11)
+    wanted = torch.tensor([0.02, 0.06, 0.0])[:, None, None]
+    difference = slope * wanted + torch.tensor([0.0, 0.0, 5.0])[:, None, None]
+    found = depth_steps(difference, slope, EVERYWHERE[:1].expand(3, -1, -1), 1)
+    step = (9 * 0.02 + 1 * 0.06) / 10
+    torch.testing.assert_close(found.step, torch.full((9, 11), step))
+    torch.testing.assert_close(found.slope, torch.full((9, 11), 10.0).sqrt())
+    left = (9 * (3 * (0.02 - step)) ** 2 + 1 * (0.06 - step) ** 2) / 10
+    torch.testing.assert_close(found.left_over, torch.full((9, 11), left).sqrt(), rtol=1e-3, atol=1e-5)
+
+
 def test_pixels_not_known_have_no_part_in_it() -> None:
-    slope, difference = torch.ones((9, 11)), torch.full((9, 11), 0.02)
+    slope, difference = torch.ones((2, 9, 11)), torch.full((2, 9, 11), 0.02)
     where = EVERYWHERE.clone()
-    where[4, 5] = False
-    slope[4, 5], difference[4, 5] = torch.nan, 1e6
+    where[:, 4, 5] = False
+    where[1, 6] = False  # of one channel alone
+    slope[~where], difference[~where] = torch.nan, 1e6
     found = depth_steps(difference, slope, where, 1)
     torch.testing.assert_close(found.step, torch.full((9, 11), 0.02))
 
 
 def test_exposure_is_the_median_of_ratios() -> None:
-    here = torch.tensor([0.1, 0.2, 0.4, 0.5, 0.0])
-    there = 1.7 * here
-    there[2] = 1.0  # a glint
-    assert float(exposure_ratio(here, there)) == pytest.approx(1.7)
+    here = torch.tensor([[0.1, 0.2, 0.4, 0.5, 0.0], [0.3, 0.1, 0.1, 0.2, 0.6]])
+    there = torch.tensor([[1.7], [0.8]]) * here
+    there[:, 2] = 1.0  # a glint
+    assert exposure_ratio(here, there).tolist() == pytest.approx([1.7, 0.8])
 
 
 def test_means_are_those_of_cells_with_enough_places() -> None:
-    values, cell = torch.tensor([1.0, 3.0, 10.0, 5.0, 6.0, 7.0]), torch.tensor([0, 0, 1, 2, 2, 2])
-    assert means_of_cells(values, cell, 2).tolist() == [2.0, 6.0]
-    assert means_of_cells(values, cell, 4).tolist() == []
-    assert means_of_cells(values[:0], cell[:0], 1).tolist() == []
+    values = torch.tensor([[1.0, 3.0, 10.0, 5.0, 6.0, 7.0], [0.0, 4.0, 1.0, 3.0, 0.0, 0.0]])
+    cell = torch.tensor([0, 0, 1, 2, 2, 2])
+    assert means_of_cells(values, cell, 2).tolist() == [[2.0, 6.0], [2.0, 1.0]]
+    assert means_of_cells(values, cell, 4).tolist() == [[], []]
+    assert means_of_cells(values[:, :0], cell[:0], 1).tolist() == [[], []]
