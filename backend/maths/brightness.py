@@ -11,6 +11,7 @@ differences between red, green and blue (as in Mallick et al., "Beyond Lambert",
 differences are channels of their own, each in units of its own noise.
 """
 
+import math
 from dataclasses import dataclass
 
 import torch
@@ -18,6 +19,8 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
+SIGMA_OF_MEDIAN_DEVIATION = 1.4826
+"""A normal law's standard deviation, beside the median of what is off its middle."""
 STRAIGHT = 0.3
 """Largest difference between the slope on one side and on both, beside the latter: texture finer than the way
 looked at agrees in many places, shading in one."""
@@ -87,17 +90,23 @@ def depth_steps(
 
 
 def exposure_ratio(
-    here: Float[Tensor, "channels places"], there: Float[Tensor, "channels places"]
+    here: Float[Tensor, "channels boxes"], there: Float[Tensor, "channels boxes"]
 ) -> Float[Tensor, "channels"]:
-    """How many times more `there` is than `here`: the r with the least sum of |there - r here|.
+    """How many times more `there` is than `here`: the r with the least sum of |there - r here|, by channels.
 
-    That is the median of the places' ratios, in which each weighs as much as there is `here`.
+    That is the median of the boxes' ratios, in which each weighs as much as there is `here`. All are 1 where
+    that of the first channel differs from 1 by no more than chance: three standard errors of a median, by
+    the ratios' median deviation from it.
     """
     weight = here.abs()
-    ratio, order = torch.where(weight > 0, there / here, 0.0).sort(dim=-1)
+    ratios = torch.where(weight > 0, there / here, 0.0)
+    ordered, order = ratios.sort(dim=-1)
     weights_up_to = weight.gather(-1, order).cumsum(dim=-1)
     middle = (weights_up_to < weights_up_to[:, -1:] / 2).sum(dim=-1)
-    return ratio.gather(-1, middle[:, None])[:, 0]
+    ratio = ordered.gather(-1, middle[:, None])[:, 0]
+    spread = SIGMA_OF_MEDIAN_DEVIATION * (ratios[0] - ratio[0]).abs().median()
+    error = math.sqrt(math.pi / 2 / here.shape[1]) * spread
+    return torch.where((ratio[0] - 1).abs() > 3 * error, ratio, 1.0)
 
 
 def means_of_cells(

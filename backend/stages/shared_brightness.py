@@ -21,6 +21,7 @@ from scipy.ndimage import binary_erosion, gaussian_filter
 from torch import Tensor
 
 from ..maths.brightness import (
+    SIGMA_OF_MEDIAN_DEVIATION,
     Slopes,
     channels_of,
     depth_steps,
@@ -105,8 +106,9 @@ def shared_brightness(scene: Measurements, distance: Float[Tensor, "nodes nodes 
     if not compared:
         return _together([])
     differences = torch.cat([pair.differences for pair in compared], dim=1)
-    # a normal law's standard deviation by the median
-    by_view = (1.4826 * differences.abs().median(dim=1).values).clamp(min=_LEAST_DIFFERENCE)
+    by_view = (SIGMA_OF_MEDIAN_DEVIATION * differences.abs().median(dim=1).values).clamp(
+        min=_LEAST_DIFFERENCE
+    )
     return _off_outlines(scene, _together([_told(pair, by_view) for pair in compared]))
 
 
@@ -242,16 +244,16 @@ def _compared(one: _Picture, other: _Picture, nodes: int) -> _Compared | None:
         return empty.index_copy_(1, places.pixel, values).view(-1, one.camera.height, one.camera.width)
 
     here, there = channels_of(one.linear.flatten(1)[:, places.pixel]), shown(0.0)
-    difference = here * exposure_ratio(here[:, sure], there[:, sure])[:, None] - there
     _, box = torch.unique(cube_keys(places.positions[sure], _CELL * h), return_inverse=True)
-    differences = means_of_cells(difference[:, sure], box, _FEWEST_IN_BOX)
-    if not differences.shape[1]:
+    box_here, box_there = (means_of_cells(values[:, sure], box, _FEWEST_IN_BOX) for values in (here, there))
+    if not box_here.shape[1]:
         return None
+    ratio = exposure_ratio(box_here, box_there)[:, None]
     along = slopes_along(shown(-h), there, shown(h), h)
     return _Compared(
-        differences=differences,
+        differences=ratio * box_here - box_there,
         places=places.chosen(~sure),
-        difference=in_picture(difference),
+        difference=in_picture(ratio * here - there),
         slopes=Slopes(slope=in_picture(along.slope), straight=in_picture(along.straight)),
         cell=h,
     )

@@ -81,10 +81,29 @@ def test_pixels_not_known_have_no_part_in_it() -> None:
 
 
 def test_exposure_is_the_median_of_ratios() -> None:
-    here = torch.tensor([[0.1, 0.2, 0.4, 0.5, 0.0], [0.3, 0.1, 0.1, 0.2, 0.6]])
+    here = torch.tensor([[0.1, 0.2, 0.4, 0.5, 0.0], [0.3, -0.1, 0.1, 0.2, 0.6]])
     there = torch.tensor([[1.7], [0.8]]) * here
     there[:, 2] = 1.0  # a glint
     assert exposure_ratio(here, there).tolist() == pytest.approx([1.7, 0.8])
+
+
+def test_places_weigh_by_how_much_they_show() -> None:
+    """Of a colour that is hardly there, what is noise says nothing of its exposure."""
+    here = torch.tensor([[0.5, 0.6, 0.7], [0.001, 0.3, -0.001]])
+    there = torch.tensor([[1.0, 1.2, 1.4], [0.1, 0.6, 0.1]])
+    assert exposure_ratio(here, there).tolist() == pytest.approx([2.0, 2.0])
+
+
+@pytest.mark.parametrize(("exposure", "changed"), [(1.0, False), (1.003, False), (1.03, True), (0.97, True)])
+def test_exposures_are_alike_unless_more_than_chance_says_otherwise(exposure: float, changed: bool) -> None:
+    generator = torch.Generator().manual_seed(0)
+    here = 0.2 + 0.5 * torch.rand((3, 40), generator=generator)
+    there = exposure * here * (1 + 0.01 * torch.randn((3, 40), generator=generator))
+    ratio = exposure_ratio(here, there)
+    if changed:
+        torch.testing.assert_close(ratio, torch.full((3,), exposure), rtol=0.006, atol=0)
+    else:
+        assert ratio.tolist() == [1.0, 1.0, 1.0]
 
 
 def test_means_are_those_of_cells_with_enough_places() -> None:
