@@ -15,9 +15,10 @@ import math
 from dataclasses import dataclass
 
 import torch
-import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor
+
+from .correlation import window_sum
 
 SIGMA_OF_MEDIAN_DEVIATION = 1.4826
 """A normal law's standard deviation, beside the median of what is off its middle."""
@@ -74,17 +75,14 @@ def depth_steps(
     `difference` is what the photograph that the rays are of shows, less what another shows of the same
     places; it and the slope are in units of the channel's noise.
     """
-    side = 2 * radius_px + 1
+    count = window_sum(where.to(slope.dtype), radius_px).clamp(min=1)
 
     def mean(values: Float[Tensor, "channels height width"]) -> Float[Tensor, "channels height width"]:
-        known = torch.where(where, values, 0.0)
-        return F.avg_pool2d(known[None], side, stride=1, padding=radius_px)[0]
+        return window_sum(torch.where(where, values, 0.0), radius_px) / count
 
-    share = mean(torch.ones_like(difference))
-    squares = mean(slope.square()) / share.clamp(min=1e-6)
-    products = mean(slope * difference) / share.clamp(min=1e-6)
+    squares, products = mean(slope.square()), mean(slope * difference)
     step = products.sum(dim=0) / squares.sum(dim=0)
-    off = mean(difference.square()) / share.clamp(min=1e-6) - 2 * step * products + step.square() * squares
+    off = mean(difference.square()) - 2 * step * products + step.square() * squares
     left_over = (squares * off.clamp(min=0)).sum(dim=0) / squares.sum(dim=0)
     return DepthSteps(step=step, slope=squares.sum(dim=0).sqrt(), left_over=left_over.sqrt())
 
