@@ -55,7 +55,9 @@ PRESETS = MappingProxyType(
                 growth_rounds=(1, 2, 2),
                 free_leverage=1.2,
             ),
-            train=TrainConfig(levels=(32, 64, 96), rounds=(10, 10, 5), linear=LinearConfig(settled=0.01)),
+            train=TrainConfig(
+                levels=(32, 64, 96), rounds=(10, 10, 5), looks=(0, 3, 2), linear=LinearConfig(settled=0.01)
+            ),
             mesh=MeshConfig(max_faces=100_000),
         ),
         "balanced": Settings(photos=PhotosConfig(max_side_px=1024)),

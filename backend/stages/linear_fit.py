@@ -22,7 +22,7 @@ from .unseen_side import ball_behind, depth_is_bounded
 OrientedPoints = tuple[Float[Tensor, "points 3"], Float[Tensor, "points 3"], Float[Tensor, "points"]]
 """Positions, normals and weights."""
 Ask = Callable[[Float[Tensor, "nodes nodes nodes"]], ShownPlaces | None]
-"""What brightness tells about a field; None to end the fit."""
+"""What brightness tells about a field; None if nothing, and not to be asked again."""
 _FADE = 0.7
 """Share of its pull that a missed ray keeps in the next round: rays that are hit by then let go."""
 _RIM_REACH = 0.2
@@ -42,7 +42,7 @@ class LinearConfig:
     inner_outlines: bool = True
     """Whether bridges are looked for where photographs show that one part hides another."""
     brightness: float = 1.0
-    """Of places that brightness tells where no texture does, on the finest grid; 0 not to look for any."""
+    """Of places that brightness tells where no texture does; 0 not to look for any."""
     silhouettes: float = 0.2
     """On rays through the subject that miss the field."""
     rims: float = 0.2
@@ -78,14 +78,16 @@ def fit_level(
     config: LinearConfig,
     far: Sequence[FarSide] = (),
     ask: Ask = ask_nothing,
+    looks: int = 0,
 ) -> Float[Tensor, "nodes nodes nodes"]:
     """The smoothest field near the points' planes that silhouettes allow, else like the level before.
 
     Smooth is measured against the ball behind, whose curvature is free. Free space (f > 0) and silhouettes
     (f < 0 somewhere on each ray) are inequalities: they pull only where the field says otherwise, which
     takes a few rounds; `rounds` at most, fewer where the surface comes to rest. What is before `far` sides is
-    free as what is before measured depth. When it is done, `ask` is told the field: as long as it answers
-    with places, these are points as well, in place of those it answered before, and there is one more round.
+    free as what is before measured depth. Before each of the last `looks` rounds, and if the surface rests
+    earlier, `ask` is told the field: the places that it answers with are points as well, in place of those of
+    the round before.
     """
     nodes = before.shape[0]
     h = spacing(nodes)
@@ -102,6 +104,11 @@ def fit_level(
     rays, nearest = rim_rays(scene, nodes), nearest_tree(points[0].cpu().numpy())
     distance, left = before, rounds
     while left:
+        if left <= looks:
+            if (shown := ask(distance)) is None:
+                looks = 0
+            else:
+                measured = _near_nodes(_points(scene, config, h / 2, shown), nodes, config)
         target, weight = before.clone(), torch.full_like(before, config.prior * (32 / nodes) ** 2)
         carved = free & (distance < bound)
         target[carved], weight[carved] = bound[carved], config.free_space
@@ -121,10 +128,8 @@ def fit_level(
         distance = ball + fit_smooth(
             target / total - ball, total, last - ball, smoothness=config.smoothness, steps=30
         )
-        left = 0 if _movement(last, distance) < config.settled * h else left - 1
-        if not left and (shown := ask(distance)) is not None:
-            measured = _near_nodes(_points(scene, config, h / 2, shown), nodes, config)
-            left = 1
+        rests = _movement(last, distance) < config.settled * h
+        left = left - 1 if not rests else looks if looks < left else 0
     return distance
 
 

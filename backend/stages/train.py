@@ -26,9 +26,6 @@ from .shared_brightness import decision as of_brightness
 from .surface import COARSEST, ShowSurface, Surface, show_nothing, tight_frame
 from .unseen_depth import depth_behind
 
-_LOOKS = 2
-"""How often photographs' brightness is asked on the finest grid, each time from the field so far."""
-
 
 @dataclass(frozen=True, kw_only=True)
 class TrainConfig:
@@ -40,6 +37,9 @@ class TrainConfig:
     """Gradient steps at each level."""
     rounds: tuple[int, ...] = (15, 15, 10)
     """How often the linear fit asks at each level which inequalities are broken."""
+    looks: tuple[int, int, int] = (0, 10, 3)
+    """Before how many of the last rounds it asks what brightness tells, if patches are mostly silent:
+    on the first grid, on those between, on the last one."""
     linear: LinearConfig = field(default_factory=LinearConfig)
     render: RenderConfig = field(default_factory=RenderConfig)
     budget_s: float | None = None
@@ -80,7 +80,8 @@ def fit_surface(
     done, rendered, taken_back = 0, 0, 0
     told: list[FarSide] = []
     shown: list[ShownPlaces] = []
-    for wanted, rounds, steps in zip(config.levels, config.rounds, config.steps, strict=True):
+    levels = zip(config.levels, config.rounds, config.steps, strict=True)
+    for level, (wanted, rounds, steps) in enumerate(levels):
         nodes = finest_grid(costs, len(distance), wanted, deadline.left_s())
         if nodes == len(distance) < wanted:
             break
@@ -91,9 +92,17 @@ def fit_surface(
             is_second = config.linear.inner_outlines and len(costs) == 2
             far = far_sides(scene, distance) if is_second else []
             told += far
-            is_last = config.linear.brightness > 0 and nodes == config.levels[-1]
-            ask = _asking(scene, shown, deadline, began_s) if is_last else ask_nothing
-            distance = fit_level(scene, refined(distance, nodes), radius, rounds, config.linear, far, ask)
+            ask = _asking(scene, shown, deadline, began_s) if config.linear.brightness else ask_nothing
+            distance = fit_level(
+                scene,
+                refined(distance, nodes),
+                radius,
+                rounds,
+                config.linear,
+                far=far,
+                ask=ask,
+                looks=_looks(config, level),
+            )
         done += 10
         show(Surface(distance=distance.cpu().numpy(), grid_from_world=frame.object_from_world))
         costs.append(GridCost(nodes=nodes, seconds=clock() - began_s))
@@ -112,12 +121,17 @@ def fit_surface(
     return Surface(distance=distance.cpu().numpy(), grid_from_world=frame.object_from_world, decisions=made)
 
 
+def _looks(config: TrainConfig, level: int) -> int:
+    first, between, last = config.looks
+    return last if level == len(config.levels) - 1 else between if level else first
+
+
 def _asking(scene: Measurements, shown: list[ShownPlaces], deadline: Deadline, began_s: float) -> Ask:
-    """Asks brightness, a few times while there is time, and keeps what it answers in `shown`."""
+    """Asks brightness while there is time, and keeps what it answers in `shown`."""
 
     def ask(distance: Float[Tensor, "nodes nodes nodes"]) -> ShownPlaces | None:
         # a look and a round take less than the fit did until here
-        if len(shown) == _LOOKS or deadline.left_s() < deadline.clock() - began_s:
+        if deadline.left_s() < deadline.clock() - began_s:
             return None
         shown.append(shared_brightness(scene, distance))
         return shown[-1] if len(shown[-1].weights) else None

@@ -14,7 +14,7 @@ from backend.maths.grid import node_positions, read, spacing
 from backend.maths.srgb import srgb_from_linear
 from backend.stages.linear_fit import LinearConfig, ask_nothing, fit_level
 from backend.stages.measurements import Measurements
-from backend.stages.shared_brightness import decision, shared_brightness
+from backend.stages.shared_brightness import ShownPlaces, decision, shared_brightness
 
 NODES, SIZE, RADIUS = 64, 320, 0.6
 TOO_LARGE = 0.03
@@ -170,20 +170,56 @@ def test_a_fit_goes_to_what_was_told() -> None:
     measured, before = scene(), too_large()
     shown = shared_brightness(measured, before)
     told = shown.chosen(shown.positions[:, 1] > 0.1)
-    answers = [told, told, None]
     fields = [
-        fit_level(measured, before, RADIUS, 3, LinearConfig(), ask=ask)
-        for ask in (ask_nothing, lambda distance: answers.pop(0))
+        fit_level(measured, before, RADIUS, 3, LinearConfig(), ask=ask, looks=1)
+        for ask in (ask_nothing, lambda distance: told)
     ]
-    assert not answers
     off = [float(read(field, told.positions).abs().median()) for field in fields]
     assert off[1] < 0.5 * off[0]
     assert off[1] < 0.3 * spacing(NODES)
 
 
-def test_brightness_is_asked_about_the_field_so_far() -> None:
-    measured, before, asked = scene(), too_large(), list[Field]()
-    assert fit_level(measured, before, RADIUS, 3, LinearConfig(), ask=asked.append) is asked[0]
+@pytest.mark.parametrize(("rounds", "looks", "times"), [(4, 2, 2), (3, 5, 3), (3, 0, 0)])
+def test_brightness_is_asked_about_the_field_so_far_before_the_last_rounds(
+    rounds: int, looks: int, times: int
+) -> None:
+    measured, asked = scene(), list[Field]()
+    told = shared_brightness(measured, too_large())
+
+    def ask(distance: Field) -> ShownPlaces:
+        asked.append(distance)
+        return told
+
+    config = LinearConfig(settled=0.0)
+    after = fit_level(measured, too_large(), RADIUS, rounds, config, ask=ask, looks=looks)
+    assert len(asked) == times
+    assert not any(torch.equal(field, after) for field in asked)
+    if times < rounds and times:  # rounds without it come first, and give the field that it is asked about
+        first = fit_level(measured, too_large(), RADIUS, rounds - times, config)
+        torch.testing.assert_close(asked[0], first)
+
+
+def test_a_surface_at_rest_goes_on_to_the_looks_and_one_that_they_do_not_move_ends() -> None:
+    measured, asked = scene(), list[Field]()
+    told = shared_brightness(measured, too_large())
+
+    def ask(distance: Field) -> ShownPlaces:
+        asked.append(distance)
+        return told
+
+    fit_level(measured, too_large(), RADIUS, 9, LinearConfig(settled=100.0), ask=ask, looks=4)
+    assert len(asked) == 1
+
+
+def test_who_has_nothing_to_tell_is_not_asked_again() -> None:
+    measured, asked = scene(), list[Field]()
+    config = LinearConfig(settled=0.0)
+    fields = [
+        fit_level(measured, too_large(), RADIUS, 4, config, ask=ask, looks=3)
+        for ask in (asked.append, ask_nothing)
+    ]
+    assert len(asked) == 1
+    torch.testing.assert_close(*fields, rtol=0, atol=0)
 
 
 def test_the_report_says_what_it_was_worth() -> None:
