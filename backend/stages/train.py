@@ -17,7 +17,7 @@ from ..maths.grid import refined, spacing
 from ..scene import Decision, Progress, Region, StereoResult, View, within
 from .deadline import Clock, Deadline, GridCost, deadline_after, finest_grid, predicted_s
 from .inner_outlines import FarSide, decision, far_sides
-from .linear_fit import Ask, LinearConfig, ask_nothing, fit_level, start
+from .linear_fit import Ask, LinearConfig, fit_level, start
 from .measurements import Measurements, carried, measurements
 from .render_fit import RenderConfig, refine
 from .safe_steps import not_finite
@@ -92,17 +92,11 @@ def fit_surface(
             is_second = config.linear.inner_outlines and len(costs) == 2
             far = far_sides(scene, distance) if is_second else []
             told += far
-            ask = _asking(scene, shown, deadline, began_s) if config.linear.brightness else ask_nothing
-            distance = fit_level(
-                scene,
-                refined(distance, nodes),
-                radius,
-                rounds,
-                config.linear,
-                far=far,
-                ask=ask,
-                looks=_looks(config, level),
-            )
+            looks = _looks(config, level)
+            tell = within(progress, done / total, (done + 10) / total)
+            ask = _asking(scene, shown, looks, deadline, began_s, tell)
+            before = refined(distance, nodes)
+            distance = fit_level(scene, before, radius, rounds, config.linear, far=far, ask=ask, looks=looks)
         done += 10
         show(Surface(distance=distance.cpu().numpy(), grid_from_world=frame.object_from_world))
         costs.append(GridCost(nodes=nodes, seconds=clock() - began_s))
@@ -123,16 +117,27 @@ def fit_surface(
 
 def _looks(config: TrainConfig, level: int) -> int:
     first, between, last = config.looks
+    if not config.linear.brightness:
+        return 0
     return last if level == len(config.levels) - 1 else between if level else first
 
 
-def _asking(scene: Measurements, shown: list[ShownPlaces], deadline: Deadline, began_s: float) -> Ask:
-    """Asks brightness while there is time, and keeps what it answers in `shown`."""
+def _asking(
+    scene: Measurements,
+    shown: list[ShownPlaces],
+    looks: int,
+    deadline: Deadline,
+    began_s: float,
+    progress: Progress,
+) -> Ask:
+    """Asks brightness, `looks` times while there is time, and keeps what it answers in `shown`."""
+    before = len(shown)
 
     def ask(distance: Float[Tensor, "nodes nodes nodes"]) -> ShownPlaces | None:
         # a look and a round take less than the fit did until here
         if deadline.left_s() < deadline.clock() - began_s:
             return None
+        progress((len(shown) - before) / looks, "looking where photographs are equally bright")
         shown.append(shared_brightness(scene, distance))
         return shown[-1] if len(shown[-1].weights) else None
 
