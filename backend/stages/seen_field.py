@@ -1,13 +1,15 @@
 """A field as the pixels of a photograph see it, and photographs made smaller for looking at it."""
 
+import math
 from dataclasses import dataclass
 
+import torch
 import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from ..maths.geometry import Pinhole, pixel_centres, ray_directions
-from ..maths.grid import locate, value_and_gradient
+from ..maths.geometry import Pinhole, pixel_centres, project, ray_directions
+from ..maths.grid import locate, node_positions, spacing, value_and_gradient
 from .silhouettes import grid_crossing, grid_entry
 
 
@@ -46,6 +48,27 @@ def seen_field(
         directions=directions,
         cosine=-(normals * directions).sum(dim=-1),
     )
+
+
+def may_show(camera: Pinhole, distance: Float[Tensor, "nodes nodes nodes"]) -> Bool[Tensor, "height width"]:
+    """Pixels whose rays may meet the field in its cube: those around what shows a node inside, or next to it.
+
+    Where there is no subject to ask about, most rays pass by the field, and are the longest to trace.
+    """
+    h, size = spacing(len(distance)), (camera.height, camera.width)
+    pixels, depth = project(camera, node_positions(len(distance), distance.device)[distance < 2 * h])
+    if not len(depth) or depth.min() < 2 * h:
+        return torch.full(size, bool(len(depth)), device=distance.device)
+    # squares of a cell as it shows at most, and those around them
+    side = math.ceil(h * float(camera.intrinsics[:2, :2].amax() / depth.min()))
+    rows, columns = math.ceil(camera.height / side) + 2, math.ceil(camera.width / side) + 2
+    square = (pixels / side).floor().long() + 1
+    x, y = square[:, 0].clamp(0, columns - 1), square[:, 1].clamp(0, rows - 1)
+    shown = torch.zeros((1, 1, rows, columns), device=distance.device)
+    shown[0, 0, y, x] = 1.0
+    around = F.max_pool2d(shown, 3, stride=1, padding=1)[0, 0, 1:-1, 1:-1] > 0
+    whole = around.repeat_interleave(side, dim=0).repeat_interleave(side, dim=1)
+    return whole[: camera.height, : camera.width]
 
 
 def smaller(camera: Pinhole, share: float) -> Pinhole:

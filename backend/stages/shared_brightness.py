@@ -35,7 +35,7 @@ from ..maths.grid import spacing
 from ..maths.srgb import linear_from_srgb
 from ..scene import Decision
 from .measurements import SURE, Measurements
-from .seen_field import at_size, seen_field, smaller
+from .seen_field import at_size, may_show, seen_field, smaller
 from .stereo_windows import neighbours
 
 _PLAIN = 0.5
@@ -188,9 +188,9 @@ def _sure_share(scene: Measurements) -> float:
 
 def _picture(scene: Measurements, index: int, distance: Float[Tensor, "nodes nodes nodes"]) -> _Picture:
     camera, subject = smaller(scene.cameras[index], _SHARE), scene.certain[index]
-    asked = torch.ones((camera.height, camera.width), dtype=torch.bool, device=distance.device)
+    asked = may_show(camera, distance)
     if subject is not None:
-        asked = at_size(subject, camera) < 0
+        asked &= at_size(subject, camera) < 0
     seen = seen_field(camera, asked, distance)
     depth, facing = torch.zeros(asked.shape, device=asked.device), torch.zeros_like(asked)
     depth[asked] = torch.where(seen.hit, seen.depth, 0.0)
