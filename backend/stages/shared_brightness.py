@@ -10,6 +10,7 @@ places that their texture evens out (on what shines, brightness depends on the v
 it); and by what one step leaves unexplained in a window (texture, edges, something else in front).
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -44,6 +45,8 @@ _PARTNERS = 2
 """Photographs that each one is compared with, at most."""
 _SHARE = 0.5
 """Of the photographs' size at which brightness is looked at."""
+_MOST_PIXELS = 60_000
+"""Of a picture: where the subject is not known, and surroundings fill it, brightness is looked at smaller."""
 _BLUR_PX = 1.0
 """There; noise is averaged, shading is left."""
 _MARGIN_PX = 3
@@ -187,10 +190,9 @@ def _sure_share(scene: Measurements) -> float:
 
 
 def _picture(scene: Measurements, index: int, distance: Float[Tensor, "nodes nodes nodes"]) -> _Picture:
-    camera, subject = smaller(scene.cameras[index], _SHARE), scene.certain[index]
-    asked = may_show(camera, distance)
-    if subject is not None:
-        asked &= at_size(subject, camera) < 0
+    camera, asked = _asked(scene, index, distance, _SHARE)
+    if (num_asked := int(asked.sum())) > _MOST_PIXELS:
+        camera, asked = _asked(scene, index, distance, _SHARE * math.sqrt(_MOST_PIXELS / num_asked))
     seen = seen_field(camera, asked, distance)
     depth, facing = torch.zeros(asked.shape, device=asked.device), torch.zeros_like(asked)
     depth[asked] = torch.where(seen.hit, seen.depth, 0.0)
@@ -209,6 +211,15 @@ def _picture(scene: Measurements, index: int, distance: Float[Tensor, "nodes nod
             sure=(at_size(scene.confidences[index], camera) > SURE)[asked][wanted],
         ),
     )
+
+
+def _asked(
+    scene: Measurements, index: int, distance: Float[Tensor, "nodes nodes nodes"], share: float
+) -> tuple[Pinhole, Bool[Tensor, "height width"]]:
+    """A camera of so much of a photograph's size, and its pixels on the subject that may show the field."""
+    camera, subject = smaller(scene.cameras[index], share), scene.certain[index]
+    asked = may_show(camera, distance)
+    return camera, asked if subject is None else asked & (at_size(subject, camera) < 0)
 
 
 def _blurred(

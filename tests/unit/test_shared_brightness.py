@@ -12,6 +12,7 @@ from torch import Tensor
 from backend.maths.geometry import Pinhole, pixel_centres, project, ray_directions, unproject
 from backend.maths.grid import node_positions, read, spacing
 from backend.maths.srgb import srgb_from_linear
+from backend.stages import shared_brightness as stage
 from backend.stages.linear_fit import LinearConfig, ask_nothing, fit_level
 from backend.stages.measurements import Measurements
 from backend.stages.shared_brightness import ShownPlaces, decision, shared_brightness
@@ -130,6 +131,14 @@ def test_colour_tells_what_shine_hides() -> None:
     )
     assert error(red[red[:, 1] > 0.1]) < 0.1 * TOO_LARGE
     assert error(red[red[:, 1] > 0.1]) < 0.2 * error(grey[grey[:, 1] > 0.1])
+
+
+def test_pictures_of_much_are_looked_at_smaller(monkeypatch: pytest.MonkeyPatch) -> None:
+    everything = shared_brightness(scene(), too_large())
+    monkeypatch.setattr(stage, "_MOST_PIXELS", 3000)  # of some 11 000
+    fewer = shared_brightness(scene(), too_large())
+    assert 0.1 * len(everything.weights) < len(fewer.weights) < 0.4 * len(everything.weights)
+    assert error(fewer.positions[fewer.positions[:, 1] > 0.15]) < 0.15 * TOO_LARGE
 
 
 def test_nothing_is_told_where_patches_agree_on_most() -> None:
