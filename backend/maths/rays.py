@@ -1,11 +1,13 @@
 """Searching rays for the surface of a distance field."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor
+
+from .rows import Rows
 
 _TOGETHER = 8
 """Steps of all rays before those that are done are left out."""
@@ -85,13 +87,12 @@ def first_crossing(
         for _ in range(first, min(first + _TOGETHER, steps)):
             rays = _traced(rays, distance, shortest, longest)
         place[rays.number], hit[rays.number] = rays.at, rays.met
-        left = ~rays.met & (rays.last < rays.end)
-        rays = _Rays(**{field.name: getattr(rays, field.name)[left] for field in fields(_Rays)})
+        rays = rays.chosen(~rays.met & (rays.last < rays.end))
     return Crossing(along=place, hit=hit)
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Rays:
+class _Rays(Rows):
     """Rays on their way; lengths are distances from their origins."""
 
     number: Int64[Tensor, "rays"]

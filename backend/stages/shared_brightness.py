@@ -1,8 +1,8 @@
-"""Places that brightness tells: a surface without texture, but matt and shaded.
+"""Places that brightness and colour tell: a surface without texture, but matt and shaded, or coloured.
 
 Patches are compared without their mean and say nothing where there is only shading, which on smooth
 things is most of what photographs see. Where two photographs see the same place of the field and
-brightness changes evenly along the rays, the depth at which both are equally bright is a measurement
+what they show changes evenly along the rays, the depth at which both show the same is a measurement
 (maths/brightness.py).
 
 How far it can be trusted is measured twice: by what differs where patches do agree, averaged over so many
@@ -33,6 +33,7 @@ from ..maths.brightness import (
 from ..maths.evidence import cube_keys
 from ..maths.geometry import Pinhole, project, sample_image
 from ..maths.grid import spacing
+from ..maths.rows import Rows
 from ..maths.srgb import linear_from_srgb
 from ..scene import Decision
 from .measurements import SURE, Measurements
@@ -79,19 +80,13 @@ _LARGEST_DEVIATION = 0.02
 
 
 @dataclass(frozen=True, kw_only=True)
-class ShownPlaces:
+class ShownPlaces(Rows):
     """Oriented points that brightness tells."""
 
     positions: Float[Tensor, "points 3"]
     normals: Float[Tensor, "points 3"]
     weights: Float[Tensor, "points"]
     """Beside a sure stereo point, 0 to 1."""
-
-    def chosen(self, which: Bool[Tensor, "points"]) -> "ShownPlaces":
-        """Some of them."""
-        return ShownPlaces(
-            positions=self.positions[which], normals=self.normals[which], weights=self.weights[which]
-        )
 
 
 def shared_brightness(scene: Measurements, distance: Float[Tensor, "nodes nodes nodes"]) -> ShownPlaces:
@@ -128,20 +123,7 @@ def decision(shown: Sequence[ShownPlaces]) -> Decision:
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Picture:
-    """A photograph's brightness, and the places of the field that its pixels see."""
-
-    camera: Pinhole
-    """Of a smaller picture."""
-    linear: Float[Tensor, "3 height width"]
-    """Blurred."""
-    depth: Float[Tensor, "height width"]
-    """Of the field, along the axis; 0 where it is missed, and near where it turns away."""
-    places: "_Places"
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Places:
+class _Places(Rows):
     """Of the field, that pixels see."""
 
     pixel: Int64[Tensor, "places"]
@@ -153,15 +135,18 @@ class _Places:
     sure: Bool[Tensor, "places"]
     """Whether patches agree there."""
 
-    def chosen(self, which: Bool[Tensor, "places"]) -> "_Places":
-        """Some of them."""
-        return _Places(
-            pixel=self.pixel[which],
-            positions=self.positions[which],
-            normals=self.normals[which],
-            directions=self.directions[which],
-            sure=self.sure[which],
-        )
+
+@dataclass(frozen=True, kw_only=True)
+class _Picture:
+    """A photograph's light, and the places of the field that its pixels see."""
+
+    camera: Pinhole
+    """Of a smaller picture."""
+    linear: Float[Tensor, "3 height width"]
+    """Blurred."""
+    depth: Float[Tensor, "height width"]
+    """Of the field, along the axis; 0 where it is missed, and near where it turns away."""
+    places: _Places
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -246,15 +231,17 @@ def _compared(one: _Picture, other: _Picture, nodes: int) -> _Compared | None:
     if not sure.any():
         return None
 
-    def shown(step: float) -> Float[Tensor, "channels places"]:
-        pixels, _ = project(other.camera, places.positions + step * places.directions)
+    def shown_at(pixels: Float[Tensor, "places 2"]) -> Float[Tensor, "channels places"]:
         return channels_of(sample_image(other.linear, pixels[None, None])[0, :, 0])
+
+    def shown(step: float) -> Float[Tensor, "channels places"]:
+        return shown_at(project(other.camera, places.positions + step * places.directions)[0])
 
     def in_picture(values: Shaped[Tensor, "channels places"]) -> Shaped[Tensor, "channels height width"]:
         empty = values.new_zeros((len(values), one.camera.height * one.camera.width))
         return empty.index_copy_(1, places.pixel, values).view(-1, one.camera.height, one.camera.width)
 
-    here, there = channels_of(one.linear.flatten(1)[:, places.pixel]), shown(0.0)
+    here, there = channels_of(one.linear.flatten(1)[:, places.pixel]), shown_at(at[same])
     _, box = torch.unique(cube_keys(places.positions[sure], _CELL * h), return_inverse=True)
     box_here, box_there = (means_of_cells(values[:, sure], box, _FEWEST_IN_BOX) for values in (here, there))
     if not box_here.shape[1]:

@@ -11,6 +11,7 @@ from ..maths.evidence import half_cell_px, off_silhouette
 from ..maths.geometry import Pinhole, ray_directions
 from ..maths.grid import node_positions, read, spacing
 from ..maths.rays import Crossing, first_crossing, points_along, sphere_entry, sphere_span
+from ..maths.rows import Rows
 from .measurements import Measurements
 
 _AROUND = 1.75
@@ -31,7 +32,7 @@ def least_distance(scene: Measurements, nodes: int) -> Float[Tensor, "nodes node
 
 
 @dataclass(frozen=True, kw_only=True)
-class SilhouetteRays:
+class SilhouetteRays(Rows):
     """Rays through the subject; each must meet an inside somewhere."""
 
     origins: Float[Tensor, "rays 3"]
@@ -41,15 +42,6 @@ class SilhouetteRays:
     """Where a ray comes near the grid, as far from its origin."""
     from_outline: Float[Tensor, "rays"]
     """Distance of the ray from the outline's rays, in units of the distance from the origin."""
-
-    def chosen(self, which: Bool[Tensor, "rays"]) -> "SilhouetteRays":
-        """Some of them."""
-        return SilhouetteRays(
-            origins=self.origins[which],
-            directions=self.directions[which],
-            entry=self.entry[which],
-            from_outline=self.from_outline[which],
-        )
 
 
 def silhouette_rays(scene: Measurements, nodes: int) -> SilhouetteRays:

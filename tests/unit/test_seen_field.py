@@ -32,6 +32,18 @@ def test_every_pixel_that_meets_the_field_may_show_it(
     assert not (hit & ~may_show(camera, field)).any()
 
 
+def test_no_pixel_is_left_out_between_nodes_that_lie_behind_one_another() -> None:
+    """From far off, rolled by 45 degrees, squares of a cell's size lie between the nodes as they show."""
+    field = node_positions(16, CPU)[..., 2].abs() - 0.4
+    camera = looking_along_z(1000.0, focal_px=40_000.0)
+    c = 0.5**0.5
+    camera.camera_from_object[:2, :2] = torch.tensor([[c, -c], [c, c]])
+    seen = seen_field(camera, torch.ones((120, 160), dtype=torch.bool), field)
+    hit = (seen.hit & (seen.positions.abs().amax(dim=-1) <= 1)).view(120, 160)
+    assert hit.any()
+    assert not (hit & ~may_show(camera, field)).any()
+
+
 def test_rays_that_pass_by_are_told() -> None:
     field = node_positions(64, CPU).norm(dim=-1) - 0.3
     camera = looking_along_z(3.0)
