@@ -53,12 +53,29 @@ class LinearConfig:
     """Movement of the surface in a round, in cells on average, below which no further round is asked for."""
     spread_cells: float = 1.0
     """How far points speak across their normals; twice as far along them."""
+    stereo: float = 1.0
+    """Of what stereo measured, beside what brightness tells."""
     confidence_power: float = 3.0
     """Points weigh as this power of their confidence."""
     correlated: bool = True
     """Neighbouring pixels are matched by nearly the same windows: their errors are one error."""
     ball: float | None = None
     """Radius of the ball behind, in half widths of the subject; None to find it out."""
+
+
+def for_plain(config: LinearConfig, textured: float) -> LinearConfig:
+    """For the last grid where brightness tells what patches do not: smoother, and led by outlines.
+
+    Patches that agree where there is little texture are few, lie along edges of paint, and know their depth
+    better than their slope: at full weight each line of them is a dent in what is smooth around it. The less
+    is `textured` (shared_brightness), from 1 down to 0, the less they weigh.
+    """
+    return replace(
+        config,
+        stereo=textured * config.stereo,
+        smoothness=(2 - textured) * config.smoothness,
+        rims=(3 - 2 * textured) * config.rims,
+    )
 
 
 def start(scene: Measurements, radius: float, nodes: int) -> Float[Tensor, "nodes nodes nodes"]:
@@ -77,6 +94,7 @@ def fit_level(
     rounds: int,
     config: LinearConfig,
     far: Sequence[FarSide] = (),
+    told: ShownPlaces | None = None,
     ask: Ask = ask_nothing,
     looks: int = 0,
 ) -> Float[Tensor, "nodes nodes nodes"]:
@@ -85,13 +103,13 @@ def fit_level(
     Smooth is measured against the ball behind, whose curvature is free. Free space (f > 0) and silhouettes
     (f < 0 somewhere on each ray) are inequalities: they pull only where the field says otherwise, which
     takes a few rounds; `rounds` at most, fewer where the surface comes to rest. What is before `far` sides is
-    free as what is before measured depth. Before each of the last `looks` rounds, and if the surface rests
-    earlier, `ask` is told the field: the places that it answers with are points as well, in place of those of
-    the round before.
+    free as what is before measured depth. What brightness has `told` about the level before is a point, too.
+    Before each of the last `looks` rounds, and if the surface rests earlier, `ask` is told the field: the
+    places that it answers with stand in place of those.
     """
     nodes = before.shape[0]
     h = spacing(nodes)
-    points = _points(scene, config, h / 2)
+    points = _points(scene, config, h / 2, told)
     measured = _near_nodes(points, nodes, config)
     ball = ball_behind(scene, radius, nodes)
     bound = least_distance(scene, nodes)
@@ -138,7 +156,7 @@ def _points(
 ) -> OrientedPoints:
     """What stereo measured and what brightness tells, merged in cubes."""
     positions, normals = scene.positions, scene.normals
-    sure = scene.confidence**config.confidence_power
+    sure = config.stereo * scene.confidence**config.confidence_power
     if shown is not None:
         positions = torch.cat([positions, shown.positions])
         normals = torch.cat([normals, shown.normals])

@@ -91,7 +91,7 @@ class ShownPlaces(Rows):
 
 def shared_brightness(scene: Measurements, distance: Float[Tensor, "nodes nodes nodes"]) -> ShownPlaces:
     """Where the field's surface should be, of all places that two photographs see and patches do not tell."""
-    if _sure_share(scene) > _PLAIN:
+    if textured(scene) > 1:
         return _together([])
     pictures = [_picture(scene, index, distance) for index in range(len(scene.cameras))]
     partners = neighbours(scene.cameras, _PARTNERS)
@@ -108,6 +108,16 @@ def shared_brightness(scene: Measurements, distance: Float[Tensor, "nodes nodes 
         min=_LEAST_DIFFERENCE
     )
     return _off_outlines(scene, _together([_told(pair, by_view) for pair in compared]))
+
+
+def textured(scene: Measurements) -> float:
+    """On how much of the subject, or of all where it is not known, patches agree; 1 where that is enough."""
+    subjects = [
+        torch.ones_like(confidence, dtype=torch.bool) if subject is None else subject < 0
+        for subject, confidence in zip(scene.certain, scene.confidences, strict=True)
+    ]
+    sure = [(c[on] > SURE).sum() for c, on in zip(scene.confidences, subjects, strict=True)]
+    return float(sum(sure) / max(sum(int(on.sum()) for on in subjects), 1)) / _PLAIN
 
 
 def decision(shown: Sequence[ShownPlaces]) -> Decision:
@@ -162,16 +172,6 @@ class _Compared:
     """Of them, [channels, height, width]; straight nowhere but at the places that both show."""
     cell: float
     """Side of a cell of the grid."""
-
-
-def _sure_share(scene: Measurements) -> float:
-    """Of the subject's pixels, or of all where it is not known, those on which patches agree."""
-    subjects = [
-        torch.ones_like(confidence, dtype=torch.bool) if subject is None else subject < 0
-        for subject, confidence in zip(scene.certain, scene.confidences, strict=True)
-    ]
-    sure = [(c[on] > SURE).sum() for c, on in zip(scene.confidences, subjects, strict=True)]
-    return float(sum(sure) / max(sum(int(on.sum()) for on in subjects), 1))
 
 
 def _picture(scene: Measurements, index: int, distance: Float[Tensor, "nodes nodes nodes"]) -> _Picture:

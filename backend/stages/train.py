@@ -17,11 +17,11 @@ from ..maths.grid import refined, spacing
 from ..scene import Decision, Progress, Region, StereoResult, View, within
 from .deadline import Clock, Deadline, GridCost, deadline_after, finest_grid, predicted_s
 from .inner_outlines import FarSide, decision, far_sides
-from .linear_fit import Ask, LinearConfig, fit_level, start
+from .linear_fit import Ask, LinearConfig, fit_level, for_plain, start
 from .measurements import Measurements, carried, measurements
 from .render_fit import RenderConfig, refine
 from .safe_steps import not_finite
-from .shared_brightness import ShownPlaces, shared_brightness
+from .shared_brightness import ShownPlaces, shared_brightness, textured
 from .shared_brightness import decision as of_brightness
 from .surface import COARSEST, ShowSurface, Surface, show_nothing, tight_frame
 from .unseen_depth import depth_behind
@@ -37,7 +37,7 @@ class TrainConfig:
     """Gradient steps at each level."""
     rounds: tuple[int, ...] = (15, 15, 10)
     """How often the linear fit asks at each level which inequalities are broken."""
-    looks: tuple[int, int, int] = (0, 10, 3)
+    looks: tuple[int, int, int] = (0, 6, 2)
     """Before how many of the last rounds it asks what brightness tells, if patches are mostly silent:
     on the first grid, on those between, on the last one."""
     linear: LinearConfig = field(default_factory=LinearConfig)
@@ -96,7 +96,12 @@ def fit_surface(
             tell = within(progress, done / total, (done + 10) / total)
             ask = _asking(scene, shown, looks, deadline, began_s, tell)
             before = refined(distance, nodes)
-            distance = fit_level(scene, before, radius, rounds, config.linear, far=far, ask=ask, looks=looks)
+            so_far = shown[-1] if shown and len(shown[-1].weights) else None
+            is_plain = so_far is not None and level == len(config.levels) - 1
+            linear = for_plain(config.linear, textured(scene)) if is_plain else config.linear
+            distance = fit_level(
+                scene, before, radius, rounds, linear, far=far, told=so_far, ask=ask, looks=looks
+            )
         done += 10
         show(Surface(distance=distance.cpu().numpy(), grid_from_world=frame.object_from_world))
         costs.append(GridCost(nodes=nodes, seconds=clock() - began_s))

@@ -10,12 +10,12 @@ from jaxtyping import Float
 from torch import Tensor
 
 from backend.maths.geometry import Pinhole, pixel_centres, project, ray_directions, unproject
-from backend.maths.grid import node_positions, read, spacing
+from backend.maths.grid import locate, node_positions, read, spacing, value_and_gradient
 from backend.maths.srgb import srgb_from_linear
 from backend.stages import shared_brightness as stage
-from backend.stages.linear_fit import LinearConfig, ask_nothing, fit_level
+from backend.stages.linear_fit import LinearConfig, ask_nothing, fit_level, for_plain
 from backend.stages.measurements import Measurements
-from backend.stages.shared_brightness import ShownPlaces, decision, shared_brightness
+from backend.stages.shared_brightness import ShownPlaces, decision, shared_brightness, textured
 
 NODES, SIZE, RADIUS = 64, 320, 0.6
 TOO_LARGE = 0.03
@@ -183,9 +183,60 @@ def test_a_fit_goes_to_what_was_told() -> None:
         fit_level(measured, before, RADIUS, 3, LinearConfig(), ask=ask, looks=1)
         for ask in (ask_nothing, lambda distance: told)
     ]
+    fields.append(fit_level(measured, before, RADIUS, 3, LinearConfig(), told=told))
     off = [float(read(field, told.positions).abs().median()) for field in fields]
     assert off[1] < 0.5 * off[0]
     assert off[1] < 0.3 * spacing(NODES)
+    assert off[2] < off[1]  # what is told before all rounds is heard in all of them
+
+
+def test_what_is_told_last_stands_in_place_of_what_was_told_before() -> None:
+    measured = scene()
+    wrong, right = (shared_brightness(measured, too_large(by)) for by in (4 * TOO_LARGE, TOO_LARGE))
+    fields = [
+        fit_level(measured, too_large(), RADIUS, 1, LinearConfig(), told=told, ask=lambda _: right, looks=1)
+        for told in (wrong, None)
+    ]
+    torch.testing.assert_close(*fields, rtol=0, atol=1e-6)
+
+
+def test_patches_are_textured_by_their_share_of_the_subject() -> None:
+    shares = [textured(scene(known_up_to=y)) for y in (-RADIUS, 0.0, RADIUS)]
+    assert shares == pytest.approx([0.0, 1.0, 2.0], abs=0.05)  # enough is half
+
+
+def test_lines_of_points_with_tilted_normals_dent_what_is_plain_less() -> None:
+    """Points on circles of the ball, as beside edges of paint: in place, but turned by 25 degrees."""
+    torch.manual_seed(0)
+    angle = torch.rand(4000) * 2 * math.pi
+    height = torch.tensor([0.15, 0.3, 0.45])[torch.arange(4000) % 3]
+    out = (1 - height**2).sqrt()
+    normals = torch.stack([out * angle.cos(), height, out * angle.sin()], dim=-1)
+    along = F.normalize(torch.cross(normals, torch.tensor([[0.0, 1.0, 0.0]]), dim=-1), dim=-1)
+    uphill, tilt = torch.cross(along, normals, dim=-1), math.radians(25)
+    tilted = math.cos(tilt) * normals + math.sin(tilt) * uphill
+    ball = scene()
+    painted = replace(
+        ball,
+        positions=torch.cat([ball.positions, RADIUS * normals]),
+        normals=torch.cat([ball.normals, tilted]),
+        colours=torch.zeros(len(ball.colours) + 4000, 3),
+        confidence=torch.cat([ball.confidence, torch.full((4000,), 0.8)]),
+    )
+
+    def dents_deg(config: LinearConfig) -> float:
+        field = fit_level(painted, too_large(0.0), RADIUS, 5, config)
+        _, gradient = value_and_gradient(field, locate(RADIUS * normals, NODES))
+        cosine = (F.normalize(gradient, dim=-1) * normals).sum(dim=-1)
+        return float(torch.rad2deg(cosine.clamp(max=1).acos()).mean())
+
+    usual, half, plain = (
+        dents_deg(config)
+        for config in (LinearConfig(), *(for_plain(LinearConfig(), share) for share in (0.5, 0.1)))
+    )
+    assert plain < 0.8 * usual
+    assert plain < half < usual
+    assert for_plain(LinearConfig(), 1.0) == LinearConfig()
 
 
 @pytest.mark.parametrize(("rounds", "looks", "times"), [(4, 2, 2), (3, 5, 3), (3, 0, 0)])

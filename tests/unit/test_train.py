@@ -7,6 +7,7 @@ gets on photographs of full size.
 from collections.abc import Callable
 from functools import cache, partial
 from itertools import count
+from typing import Any
 
 import numpy as np
 import pytest
@@ -26,7 +27,11 @@ from backend.scene import (
     transform_points,
     within,
 )
+from backend.stages import train
+from backend.stages.linear_fit import fit_level
+from backend.stages.measurements import Measurements
 from backend.stages.mesh import MeshConfig, extract_mesh, level_set, preview_mesh
+from backend.stages.shared_brightness import ShownPlaces
 from backend.stages.stereo import match_views
 from backend.stages.stereo_config import StereoConfig
 from backend.stages.surface import ShowSurface, Surface, show_nothing
@@ -353,3 +358,24 @@ def test_the_report_says_why_brightness_was_left_out() -> None:
     assert whole.choice == stopped.choice == "left out"
     assert "patches agree" in whole.because
     assert "time" in stopped.because
+
+
+def test_the_last_grid_of_a_plain_subject_is_fitted_as_such(monkeypatch: pytest.MonkeyPatch) -> None:
+    """From the grid before it hears what brightness told there, and how much of the subject is textured."""
+    heard: list[tuple[int, float, int]] = []
+    some = torch.tensor([[0.0, 0.0, 0.5], [0.0, 0.5, 0.0]])
+    places = ShownPlaces(positions=some, normals=2 * some, weights=torch.ones(2))
+
+    def spy(scene: Measurements, before: torch.Tensor, *args: Any, **words: Any) -> torch.Tensor:
+        told = words.get("told")
+        heard.append((len(before), args[2].stereo, 0 if told is None else len(told.weights)))
+        return fit_level(scene, before, *args, **words)
+
+    monkeypatch.setattr(train, "fit_level", spy)
+    monkeypatch.setattr(train, "textured", lambda scene: 0.4)
+    config = TrainConfig(levels=(16, 24, 32), rounds=(3, 3, 3), steps=(0, 0, 0), looks=(0, 1, 1))
+    for told, on_last in ((places, (32, 0.4, 2)), (places.chosen(places.weights < 0), (32, 1.0, 0))):
+        monkeypatch.setattr(train, "shared_brightness", lambda scene, distance, told=told: told)
+        heard.clear()
+        fitted(masked_scene(), true_region(), masked_stereo(), config)
+        assert heard[-3:] == [(16, 1.0, 0), (24, 1.0, 0), on_last]
