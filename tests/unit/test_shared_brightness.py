@@ -237,6 +237,9 @@ def test_lines_of_points_with_tilted_normals_dent_what_is_plain_less() -> None:
     assert plain < 0.8 * usual
     assert plain < half < usual
     assert for_plain(LinearConfig(), 1.0) == LinearConfig()
+    config = for_plain(LinearConfig(), 0.1)
+    assert dents_deg(replace(config, stereo=1.0)) > 1.1 * plain
+    assert dents_deg(replace(config, smoothness=LinearConfig().smoothness)) > 1.1 * plain
 
 
 @pytest.mark.parametrize(("rounds", "looks", "times"), [(4, 2, 2), (3, 5, 3), (3, 0, 0)])

@@ -373,9 +373,9 @@ def test_the_last_grid_of_a_plain_subject_is_fitted_as_such(monkeypatch: pytest.
 
     monkeypatch.setattr(train, "fit_level", spy)
     monkeypatch.setattr(train, "textured", lambda scene: 0.4)
-    config = TrainConfig(levels=(16, 24, 32), rounds=(3, 3, 3), steps=(0, 0, 0), looks=(0, 1, 1))
-    for told, on_last in ((places, (32, 0.4, 2)), (places.chosen(places.weights < 0), (32, 1.0, 0))):
+    config = TrainConfig(levels=(16, 20, 24, 32), rounds=(3, 3, 3, 3), steps=(0, 0, 0, 0), looks=(0, 1, 1))
+    for told, num, stereo in ((places, 2, 0.4), (places.chosen(places.weights < 0), 0, 1.0)):
         monkeypatch.setattr(train, "shared_brightness", lambda scene, distance, told=told: told)
         heard.clear()
         fitted(masked_scene(), true_region(), masked_stereo(), config)
-        assert heard[-3:] == [(16, 1.0, 0), (24, 1.0, 0), on_last]
+        assert heard[-4:] == [(16, 1.0, 0), (20, 1.0, 0), (24, 1.0, num), (32, stereo, num)]
