@@ -141,6 +141,25 @@ def test_pictures_of_much_are_looked_at_smaller(monkeypatch: pytest.MonkeyPatch)
     assert error(fewer.positions[fewer.positions[:, 1] > 0.15]) < 0.15 * TOO_LARGE
 
 
+def test_small_windows_that_go_wild_are_not_believed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """In noisy photographs: what a wide window does not confirm is far off more often than the rest."""
+    torch.manual_seed(0)
+    clean = scene()
+    images = [(image + 0.03 * torch.randn_like(image)).clamp(0, 1) for image in clean.images]
+    noisy = replace(clean, images=images)
+
+    def far_off() -> Tensor:
+        told = shared_brightness(noisy, too_large())
+        return (told.positions.norm(dim=-1) - RADIUS).abs() > spacing(NODES)
+
+    confirmed = far_off()
+    monkeypatch.setattr(stage, "_ALIKE_CELLS", math.inf)
+    everything = far_off()
+    lost = len(everything) - len(confirmed)
+    assert 0 < lost < 0.1 * len(everything)
+    assert int(everything.sum() - confirmed.sum()) > 3 * lost * float(everything.float().mean())
+
+
 def test_nothing_is_told_where_patches_agree_on_most() -> None:
     assert len(shared_brightness(scene(known_up_to=0.2), too_large()).weights) == 0
 
