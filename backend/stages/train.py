@@ -97,8 +97,7 @@ def fit_surface(
             ask = _asking(scene, shown, looks, deadline, began_s, tell)
             before = refined(distance, nodes)
             so_far = shown[-1] if shown and len(shown[-1].weights) else None
-            is_plain = so_far is not None and level == len(config.levels) - 1
-            linear = for_plain(config.linear, textured(scene)) if is_plain else config.linear
+            linear = _linear(config, level, scene, so_far)
             distance = fit_level(
                 scene, before, radius, rounds, linear, far=far, told=so_far, ask=ask, looks=looks
             )
@@ -118,6 +117,12 @@ def fit_surface(
         used_s = config.budget_s - deadline.left_s()
         made = (*made, _of_budget(config.budget_s, used_s, config, costs, rendered))
     return Surface(distance=distance.cpu().numpy(), grid_from_world=frame.object_from_world, decisions=made)
+
+
+def _linear(config: TrainConfig, level: int, scene: Measurements, told: ShownPlaces | None) -> LinearConfig:
+    """As configured; on the last grid, if brightness told something on the one before, for what is plain."""
+    is_plain = told is not None and level == len(config.levels) - 1
+    return for_plain(config.linear, textured(scene)) if is_plain else config.linear
 
 
 def _looks(config: TrainConfig, level: int) -> int:
