@@ -120,9 +120,14 @@ def fit_surface(
 
 
 def _linear(config: TrainConfig, level: int, scene: Measurements, told: ShownPlaces | None) -> LinearConfig:
-    """As configured; on the last grid, if brightness told something on the one before, for what is plain."""
-    is_plain = told is not None and level == len(config.levels) - 1
-    return for_plain(config.linear, textured(scene)) if is_plain else config.linear
+    """As configured; on the last grid, if brightness told something on the one before, for what is plain.
+
+    Where the subject is not known, how much of it is textured is not known either.
+    """
+    known = all(subject is not None for subject in scene.certain)
+    if told is None or level < len(config.levels) - 1 or not known:
+        return config.linear
+    return for_plain(config.linear, textured(scene))
 
 
 def _looks(config: TrainConfig, level: int) -> int:

@@ -361,7 +361,7 @@ def test_the_report_says_why_brightness_was_left_out() -> None:
 
 
 def test_the_last_grid_of_a_plain_subject_is_fitted_as_such(monkeypatch: pytest.MonkeyPatch) -> None:
-    """From the grid before it hears what brightness told there, and how much of the subject is textured."""
+    """From the grid before it hears what brightness told there, and how much of a known one is textured."""
     heard: list[tuple[int, float, int]] = []
     some = torch.tensor([[0.0, 0.0, 0.5], [0.0, 0.5, 0.0]])
     places = ShownPlaces(positions=some, normals=2 * some, weights=torch.ones(2))
@@ -374,8 +374,14 @@ def test_the_last_grid_of_a_plain_subject_is_fitted_as_such(monkeypatch: pytest.
     monkeypatch.setattr(train, "fit_level", spy)
     monkeypatch.setattr(train, "textured", lambda scene: 0.4)
     config = TrainConfig(levels=(16, 20, 24, 32), rounds=(3, 3, 3, 3), steps=(0, 0, 0, 0), looks=(0, 1, 1))
-    for told, num, stereo in ((places, 2, 0.4), (places.chosen(places.weights < 0), 0, 1.0)):
+    subject, unknown = (masked_scene(), true_region(), masked_stereo()), (open_scene(), ROOMY, open_stereo())
+    nothing = places.chosen(places.weights < 0)
+    for what, told, num, stereo in (
+        (subject, places, 2, 0.4),
+        (subject, nothing, 0, 1),
+        (unknown, places, 2, 1),
+    ):
         monkeypatch.setattr(train, "shared_brightness", lambda scene, distance, told=told: told)
         heard.clear()
-        fitted(masked_scene(), true_region(), masked_stereo(), config)
+        fitted(*what, config)
         assert heard[-4:] == [(16, 1.0, 0), (20, 1.0, 0), (24, 1.0, num), (32, stereo, num)]
