@@ -103,7 +103,7 @@ def fit_level(
     Smooth is measured against the ball behind, whose curvature is free. Free space (f > 0) and silhouettes
     (f < 0 somewhere on each ray) are inequalities: they pull only where the field says otherwise, which
     takes a few rounds; `rounds` at most, fewer where the surface comes to rest. What is before `far` sides is
-    free as what is before measured depth. What brightness has `told` about the level before is a point, too.
+    free as what is before measured depth. Places `told` about the level before are points as well.
     Before each of the last `looks` rounds, and if the surface rests earlier, `ask` is told the field: the
     places that it answers with stand in place of those.
     """

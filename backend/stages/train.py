@@ -96,7 +96,7 @@ def fit_surface(
             tell = within(progress, done / total, (done + 10) / total)
             ask = _asking(scene, shown, looks, deadline, began_s, tell)
             before = refined(distance, nodes)
-            so_far = shown[-1] if shown and len(shown[-1].weights) else None
+            so_far = _told_last(shown)
             linear = _linear(config, level, scene, so_far)
             distance = fit_level(
                 scene, before, radius, rounds, linear, far=far, told=so_far, ask=ask, looks=looks
@@ -117,6 +117,11 @@ def fit_surface(
         used_s = config.budget_s - deadline.left_s()
         made = (*made, _of_budget(config.budget_s, used_s, config, costs, rendered))
     return Surface(distance=distance.cpu().numpy(), grid_from_world=frame.object_from_world, decisions=made)
+
+
+def _told_last(shown: Sequence[ShownPlaces]) -> ShownPlaces | None:
+    """What brightness told at the last look; None if nothing."""
+    return shown[-1] if shown and len(shown[-1].weights) else None
 
 
 def _linear(config: TrainConfig, level: int, scene: Measurements, told: ShownPlaces | None) -> LinearConfig:
@@ -154,7 +159,7 @@ def _asking(
             return None
         progress((len(shown) - before) / looks, "looking where photographs are equally bright")
         shown.append(shared_brightness(scene, distance))
-        return shown[-1] if len(shown[-1].weights) else None
+        return _told_last(shown)
 
     return ask
 
