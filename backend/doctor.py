@@ -125,8 +125,15 @@ def _check_compiler() -> Check:
     from .kernels.cross_check import error_of_a_map_with_itself
     from .kernels.patch_correlation import error_of_an_image_with_itself
     from .kernels.plane_fits import error_of_a_plane
+    from .kernels.ray_crossing import error_of_a_plane_ahead
 
-    known = (error_of_a_constant, error_of_an_image_with_itself, error_of_a_plane, error_of_a_map_with_itself)
+    known = (
+        error_of_a_constant,
+        error_of_an_image_with_itself,
+        error_of_a_plane,
+        error_of_a_map_with_itself,
+        error_of_a_plane_ahead,
+    )
     started = time.perf_counter()
     error = max(error_of() for error_of in known)
     seconds = time.perf_counter() - started

@@ -30,6 +30,7 @@ checks = {
     "cross_check": "error_of_a_map_with_itself",
     "patch_correlation": "error_of_an_image_with_itself",
     "plane_fits": "error_of_a_plane",
+    "ray_crossing": "error_of_a_plane_ahead",
 }
 for module, check in checks.items():
     compiled = sys.modules[f"backend.kernels.{module}"] = types.ModuleType(module)

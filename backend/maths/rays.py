@@ -3,14 +3,21 @@
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
+from ..kernels import ray_crossing
+from ..kernels.compiled import floats
+from ..kernels.side_by_side import side_by_side
+from .grid import read
 from .rows import Rows
 
 _TOGETHER = 8
 """Steps of all rays before those that are done are left out."""
+_RAYS_IN_ONE_GO = 4096
+"""Of a thread, where compiled."""
 DistanceFunction = Callable[[Float[Tensor, "points 3"]], Float[Tensor, "points"]]
 
 
@@ -89,6 +96,41 @@ def first_crossing(
         place[rays.number], hit[rays.number] = rays.at, rays.met
         rays = rays.chosen(~rays.met & (rays.last < rays.end))
     return Crossing(along=place, hit=hit)
+
+
+def first_crossing_on_grid(
+    distance: Float[Tensor, "nodes nodes nodes"],
+    origins: Float[Tensor, "rays 3"],
+    directions: Float[Tensor, "rays 3"],
+    start: Float[Tensor, "rays"],
+    *,
+    reach: float = 2.0,
+    shortest: float = 0.005,
+    longest: float = 0.1,
+    steps: int = 40,
+) -> Crossing:
+    """`first_crossing` of a trilinear field on the cube [-1, 1]^3, which goes on as it is at its sides."""
+    if distance.device.type != "cpu" or distance.dtype != torch.float32:
+        return first_crossing(
+            lambda points: read(distance, points),
+            origins,
+            directions,
+            start,
+            reach=reach,
+            shortest=shortest,
+            longest=longest,
+            steps=steps,
+        )
+    along, hit = np.empty(len(start), np.float32), np.empty(len(start), np.bool_)
+    grid, limits = floats(distance), (reach, shortest, longest, steps)
+    rays = floats(origins), floats(directions), floats(start)
+
+    def trace(first: int) -> None:
+        rows = (first, min(first + _RAYS_IN_ONE_GO, len(along)))
+        ray_crossing.first_crossings(rows, grid, *rays, limits, along, hit)
+
+    side_by_side(trace, range(0, len(along), _RAYS_IN_ONE_GO), torch.get_num_threads())
+    return Crossing(along=torch.from_numpy(along), hit=torch.from_numpy(hit))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -23,6 +23,8 @@ OrientedPoints = tuple[Float[Tensor, "points 3"], Float[Tensor, "points 3"], Flo
 """Positions, normals and weights."""
 Ask = Callable[[Float[Tensor, "nodes nodes nodes"]], ShownPlaces | None]
 """What brightness tells about a field; None if nothing, and not to be asked again."""
+_TEXTURED = 0.5
+"""Where patches tell a larger share of the surface than this, it is fitted as what is textured."""
 _FADE = 0.7
 """Share of its pull that a missed ray keeps in the next round: rays that are hit by then let go."""
 _RIM_REACH = 0.2
@@ -68,13 +70,14 @@ def for_plain(config: LinearConfig, textured: float) -> LinearConfig:
 
     Patches that agree where there is little texture are few, lie along edges of paint, and know their depth
     better than their slope: at full weight each line of them is a dent in what is smooth around it. The less
-    is `textured` (shared_brightness), from 1 down to 0, the less they weigh.
+    of the surface is `textured` (shared_brightness), the less they weigh.
     """
+    trusted = min(1.0, (textured / _TEXTURED) ** 2)
     return replace(
         config,
-        stereo=textured * config.stereo,
-        smoothness=(2 - textured) * config.smoothness,
-        rims=(3 - 2 * textured) * config.rims,
+        stereo=trusted * config.stereo,
+        smoothness=(2 - trusted) * config.smoothness,
+        rims=(3 - 2 * trusted) * config.rims,
     )
 
 

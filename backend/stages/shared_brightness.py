@@ -40,8 +40,10 @@ from .measurements import SURE, Measurements
 from .seen_field import at_size, may_show, seen_field, smaller
 from .stereo_windows import neighbours
 
-_PLAIN = 0.5
-"""Where patches agree on a larger share of the subject's pixels, what is left is hidden or beside edges."""
+MOSTLY_TEXTURED = 0.8
+"""Where patches tell a larger share of the surface, what is left is hidden or beside edges."""
+_GLANCE = 0.125
+"""Of the photographs' size at which that share is measured."""
 _PARTNERS = 2
 """Photographs that each one is compared with, at most."""
 _SHARE = 0.5
@@ -91,8 +93,6 @@ class ShownPlaces(Rows):
 
 def shared_brightness(scene: Measurements, distance: Float[Tensor, "nodes nodes nodes"]) -> ShownPlaces:
     """Where the field's surface should be, of all places that two photographs see and patches do not tell."""
-    if textured(scene) > 1:
-        return _together([])
     pictures = [_picture(scene, index, distance) for index in range(len(scene.cameras))]
     partners = neighbours(scene.cameras, _PARTNERS)
     compared = [
@@ -110,25 +110,31 @@ def shared_brightness(scene: Measurements, distance: Float[Tensor, "nodes nodes 
     return _off_outlines(scene, _together([_told(pair, by_view) for pair in compared]))
 
 
-def textured(scene: Measurements) -> float:
-    """On how much of the subject, or of all where it is not known, patches agree; 1 where that is enough."""
-    subjects = [
-        torch.ones_like(confidence, dtype=torch.bool) if subject is None else subject < 0
-        for subject, confidence in zip(scene.certain, scene.confidences, strict=True)
-    ]
-    sure = [(c[on] > SURE).sum() for c, on in zip(scene.confidences, subjects, strict=True)]
-    return float(sum(sure) / max(sum(int(on.sum()) for on in subjects), 1)) / _PLAIN
+def textured(scene: Measurements, distance: Float[Tensor, "nodes nodes nodes"]) -> float:
+    """How much of the field's surface that photographs show is told by patches: 1 if all of it, and surely.
+
+    Surroundings that the field does not have count for nothing, whether the subject is known or not.
+    """
+    told = []
+    for index, confidence in enumerate(scene.confidences):
+        camera, asked = _asked(scene, index, distance, _GLANCE)
+        seen = seen_field(camera, asked, distance)
+        facing = seen.hit & (seen.cosine > _LEAST_COSINE)
+        told.append((at_size(confidence, camera)[asked][facing] / SURE).clamp(max=1.0))
+    return float(torch.cat(told).mean().nan_to_num())
 
 
-def decision(shown: Sequence[ShownPlaces]) -> Decision:
-    """What it was worth in a fit's passes, for the report."""
+def decision(shares: Sequence[float], shown: Sequence[ShownPlaces]) -> Decision:
+    """What it was worth in a fit's passes, for the report; `shares` are `textured` on its grids."""
     what, count = "brightness without texture", max((len(s.weights) for s in shown), default=0)
-    if not shown:
-        because = "not asked for, or time ran out before it"
-    elif not count:
-        because = "patches agree on most of the subject, or what they agree on is not equally bright"
-    else:
+    if count:
         because = f"the same from two sides, it tells the depth of {count} places that no texture tells"
+    elif shown:
+        because = "what patches agree on is not equally bright, or too little to tell"
+    elif shares and shares[-1] > MOSTLY_TEXTURED:
+        because = f"patches tell {shares[-1]:.0%} of the surface"
+    else:
+        because = "not asked for, or time ran out before it"
     return Decision(what=what, choice="used" if count else "left out", because=because)
 
 
@@ -203,8 +209,7 @@ def _asked(
 ) -> tuple[Pinhole, Bool[Tensor, "height width"]]:
     """A camera of so much of a photograph's size, and its pixels on the subject that may show the field."""
     camera, subject = smaller(scene.cameras[index], share), scene.certain[index]
-    asked = may_show(camera, distance)
-    return camera, asked if subject is None else asked & (at_size(subject, camera) < 0)
+    return camera, may_show(camera, distance) if subject is None else at_size(subject, camera) < 0
 
 
 def _blurred(

@@ -21,7 +21,7 @@ from .linear_fit import Ask, LinearConfig, fit_level, for_plain, start
 from .measurements import Measurements, carried, measurements
 from .render_fit import RenderConfig, refine
 from .safe_steps import not_finite
-from .shared_brightness import ShownPlaces, shared_brightness, textured
+from .shared_brightness import MOSTLY_TEXTURED, ShownPlaces, shared_brightness, textured
 from .shared_brightness import decision as of_brightness
 from .surface import COARSEST, ShowSurface, Surface, show_nothing, tight_frame
 from .unseen_depth import depth_behind
@@ -80,6 +80,7 @@ def fit_surface(
     done, rendered, taken_back = 0, 0, 0
     told: list[FarSide] = []
     shown: list[ShownPlaces] = []
+    shares: list[float] = []
     levels = zip(config.levels, config.rounds, config.steps, strict=True)
     for level, (wanted, rounds, steps) in enumerate(levels):
         nodes = finest_grid(costs, len(distance), wanted, deadline.left_s())
@@ -92,12 +93,11 @@ def fit_surface(
             is_second = config.linear.inner_outlines and len(costs) == 2
             far = far_sides(scene, distance) if is_second else []
             told += far
-            looks = _looks(config, level)
-            tell = within(progress, done / total, (done + 10) / total)
-            ask = _asking(scene, shown, looks, deadline, began_s, tell)
             before = refined(distance, nodes)
             so_far = _told_last(shown)
-            linear = _linear(config, level, scene, so_far)
+            linear, looks = _by_texture(config, level, scene, before, so_far, shares)
+            tell = within(progress, done / total, (done + 10) / total)
+            ask = _asking(scene, shown, looks, deadline, began_s, tell)
             distance = fit_level(
                 scene, before, radius, rounds, linear, far=far, told=so_far, ask=ask, looks=looks
             )
@@ -112,7 +112,7 @@ def fit_surface(
             taken_back += better.taken_back
             done += steps
     made = _decisions(scene, frame, config, depth, nodes=len(distance), rendered=rendered)
-    made = (*made, decision(told), of_brightness(shown), _of_rendering(config, rendered, taken_back))
+    made = (*made, decision(told), of_brightness(shares, shown), _of_rendering(config, rendered, taken_back))
     if config.budget_s is not None:
         used_s = config.budget_s - deadline.left_s()
         made = (*made, _of_budget(config.budget_s, used_s, config, costs, rendered))
@@ -124,22 +124,27 @@ def _told_last(shown: Sequence[ShownPlaces]) -> ShownPlaces | None:
     return shown[-1] if shown and len(shown[-1].weights) else None
 
 
-def _linear(config: TrainConfig, level: int, scene: Measurements, told: ShownPlaces | None) -> LinearConfig:
-    """As configured; on the last grid, if brightness told something on the one before, for what is plain.
+def _by_texture(
+    config: TrainConfig,
+    level: int,
+    scene: Measurements,
+    before: Float[Tensor, "nodes nodes nodes"],
+    told: ShownPlaces | None,
+    shares: list[float],
+) -> tuple[LinearConfig, int]:
+    """How a grid is fitted, and how often brightness is asked there.
 
-    Where the subject is not known, how much of it is textured is not known either.
+    It is asked if enough of the surface so far is not textured; how much is, is kept in `shares`. What it
+    `told` on the grid before is led by it on the last one.
     """
-    known = all(subject is not None for subject in scene.certain)
-    if told is None or level < len(config.levels) - 1 or not known:
-        return config.linear
-    return for_plain(config.linear, textured(scene))
-
-
-def _looks(config: TrainConfig, level: int) -> int:
     first, between, last = config.looks
-    if not config.linear.brightness:
-        return 0
-    return last if level == len(config.levels) - 1 else between if level else first
+    is_last = level == len(config.levels) - 1
+    looks = last if is_last else between if level else first
+    if not config.linear.brightness or not looks:
+        return config.linear, 0
+    shares.append(textured(scene, before))
+    linear = config.linear if told is None or not is_last else for_plain(config.linear, shares[-1])
+    return linear, looks if shares[-1] <= MOSTLY_TEXTURED else 0
 
 
 def _asking(

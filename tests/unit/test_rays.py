@@ -6,7 +6,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from backend.maths.rays import first_crossing, sphere_entry
+from backend.maths.grid import node_positions, read
+from backend.maths.rays import first_crossing, first_crossing_on_grid, sphere_entry
 
 RADIUS = 0.5
 
@@ -114,3 +115,63 @@ def test_a_field_without_a_surface_gives_finite_places(constant: float) -> None:
     found = first_crossing(lambda x: torch.full_like(x[:, 0], constant), origins, directions, torch.ones(5))
     assert found.along.isfinite().all()
     assert (found.hit == (constant <= 0)).all()
+
+
+def wavy_field(nodes: int) -> Tensor:
+    """A dented ball on a grid, less steep than a distance and rough from node to node."""
+    generator = torch.Generator().manual_seed(3)
+    at = node_positions(nodes, torch.device("cpu"))
+    dents = 0.1 * (7 * at).sin().prod(dim=-1) + 0.02 * torch.rand(at.shape[:-1], generator=generator)
+    return 0.8 * (at.norm(dim=-1) - RADIUS) + dents
+
+
+@pytest.mark.parametrize("scale", [0.5, 1.0, 3.0])
+def test_compiled_tracing_is_the_same_as_in_torch(scale: float) -> None:
+    """From far away, from beside the cube and from inside it; in single precision compiled, else not."""
+    origins, directions = rays_towards(9000, 0.9)
+    origins, field = scale / 3 * origins, wavy_field(33)
+    start = torch.zeros(len(origins))
+    limits = {"reach": scale + 1.5, "shortest": 0.03, "longest": 0.2, "steps": 50}
+    expected = first_crossing(lambda at: read(field, at), origins, directions, start, **limits)
+    single = first_crossing_on_grid(field, origins, directions, start, **limits)
+    rays = (values.double() for values in (field, origins, directions, start))
+    double = first_crossing_on_grid(*rays, **limits)
+    assert expected.hit.sum() > 1000
+    assert double.along.dtype == torch.float64
+    for found in (single, double):
+        assert (found.hit == expected.hit).float().mean() > 0.999
+        same = found.hit & expected.hit
+        torch.testing.assert_close(found.along[same].float(), expected.along[same], atol=2e-5, rtol=0)
+        missed = ~found.hit & ~expected.hit
+        lowest, least = (
+            read(field, (origins + where.along[:, None].float() * directions)[missed])
+            for where in (found, expected)
+        )
+        torch.testing.assert_close(lowest, least, atol=1e-4, rtol=0)
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_compiled_tracing_is_the_same_on_any_number_of_threads(
+    threads: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    origins, directions = rays_towards(20_000, 0.9)
+    start, field = sphere_entry(origins, directions), wavy_field(33)
+    expected = first_crossing_on_grid(field, origins, directions, start)
+    monkeypatch.setattr(torch, "get_num_threads", lambda: threads)
+    found = first_crossing_on_grid(field, origins, directions, start)
+    assert torch.equal(found.along, expected.along)
+    assert torch.equal(found.hit, expected.hit)
+
+
+@pytest.mark.parametrize("number", [math.nan, math.inf, -math.inf])
+def test_compiled_tracing_stays_in_the_grid_whatever_it_is_given(number: float) -> None:
+    origins, directions = rays_towards(30, 0.9)
+    field = wavy_field(9)
+    broken = torch.full_like(origins, number)
+    for rays in ((broken, directions), (origins, broken)):
+        found = first_crossing_on_grid(field, *rays, torch.zeros(30))
+        assert found.along.isfinite().all()
+    without = first_crossing_on_grid(torch.full_like(field, math.nan), origins, directions, torch.ones(30))
+    assert (without.along == 1).all()
+    assert not without.hit.any()
+    assert first_crossing_on_grid(field, origins[:0], directions[:0], torch.zeros(0)).hit.shape == (0,)

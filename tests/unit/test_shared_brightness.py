@@ -14,7 +14,7 @@ from backend.maths.grid import locate, node_positions, read, spacing, value_and_
 from backend.maths.srgb import srgb_from_linear
 from backend.stages import shared_brightness as stage
 from backend.stages.linear_fit import LinearConfig, ask_nothing, fit_level, for_plain
-from backend.stages.measurements import Measurements
+from backend.stages.measurements import SURE, Measurements
 from backend.stages.shared_brightness import ShownPlaces, decision, shared_brightness, textured
 
 NODES, SIZE, RADIUS = 64, 320, 0.6
@@ -160,10 +160,6 @@ def test_small_windows_that_go_wild_are_not_believed(monkeypatch: pytest.MonkeyP
     assert int(everything.sum() - confirmed.sum()) > 3 * lost * float(everything.float().mean())
 
 
-def test_nothing_is_told_where_patches_agree_on_most() -> None:
-    assert len(shared_brightness(scene(known_up_to=0.2), too_large()).weights) == 0
-
-
 @pytest.mark.parametrize("known_up_to", [-0.55, -1.0])
 def test_nothing_is_told_without_places_to_judge_brightness_by(known_up_to: float) -> None:
     assert len(shared_brightness(scene(known_up_to=known_up_to), too_large()).weights) == 0
@@ -219,9 +215,34 @@ def test_what_is_told_last_stands_in_place_of_what_was_told_before() -> None:
     torch.testing.assert_close(*fields, rtol=0, atol=1e-6)
 
 
-def test_patches_are_textured_by_their_share_of_the_subject() -> None:
-    shares = [textured(scene(known_up_to=y)) for y in (-RADIUS, 0.0, RADIUS)]
-    assert shares == pytest.approx([0.0, 1.0, 2.0], abs=0.05)  # enough is half
+@pytest.mark.parametrize("subject_known", [True, False])
+def test_patches_are_textured_by_their_share_of_the_surface(subject_known: bool) -> None:
+    """What the photographs show beside the ball counts for nothing, though some of it was measured."""
+
+    def share(known_up_to: float) -> float:
+        ball = scene(known_up_to=known_up_to)
+        around = [
+            torch.where(on < 0, c, 0.8)
+            for on, c in zip(ball.certain, ball.confidences, strict=True)
+            if on is not None
+        ]
+        unknown: list[Tensor | None] = [None, None]
+        return textured(
+            replace(ball, confidences=around, certain=ball.certain if subject_known else unknown),
+            too_large(0.0),
+        )
+
+    assert [share(y) for y in (-RADIUS, 0.0, RADIUS)] == pytest.approx([0.0, 0.5, 1.0], abs=0.03)
+
+
+def test_patches_that_are_not_sure_tell_less_of_the_surface() -> None:
+    ball = scene(known_up_to=RADIUS)
+    faint = replace(ball, confidences=[0.1 * (c > 0) for c in ball.confidences])
+    assert textured(faint, too_large(0.0)) == pytest.approx(0.1 / SURE, abs=0.03)
+
+
+def test_a_field_that_no_photograph_shows_has_no_texture() -> None:
+    assert textured(scene(), torch.ones(NODES, NODES, NODES)) == 0
 
 
 def test_lines_of_points_with_tilted_normals_dent_what_is_plain_less() -> None:
@@ -251,12 +272,12 @@ def test_lines_of_points_with_tilted_normals_dent_what_is_plain_less() -> None:
 
     usual, half, plain = (
         dents_deg(config)
-        for config in (LinearConfig(), *(for_plain(LinearConfig(), share) for share in (0.5, 0.1)))
+        for config in (LinearConfig(), *(for_plain(LinearConfig(), share) for share in (0.35, 0.16)))
     )
     assert plain < 0.8 * usual
     assert plain < half < usual
     assert for_plain(LinearConfig(), 1.0) == LinearConfig()
-    config = for_plain(LinearConfig(), 0.1)
+    config = for_plain(LinearConfig(), 0.16)
     assert dents_deg(replace(config, stereo=1.0)) > 1.1 * plain
     assert dents_deg(replace(config, smoothness=LinearConfig().smoothness)) > 1.1 * plain
 
@@ -306,8 +327,16 @@ def test_who_has_nothing_to_tell_is_not_asked_again() -> None:
 
 def test_the_report_says_what_it_was_worth() -> None:
     shown = shared_brightness(scene(), too_large())
-    nothing = shared_brightness(scene(known_up_to=0.2), too_large())
-    assert decision([shown, nothing]).choice == "used"
-    assert str(len(shown.weights)) in decision([shown, nothing]).because
-    assert decision([nothing]).choice == "left out"
-    assert "time" in decision([]).because
+    nothing = shared_brightness(scene(known_up_to=-1.0), too_large())
+    used = decision([0.5], [shown, nothing])
+    assert used.choice == "used"
+    assert str(len(shown.weights)) in used.because
+    for shares, told, why in (
+        ([0.5], [nothing], "too little"),
+        ([0.5, 0.93], [], "93%"),
+        ([0.5], [], "time"),
+        ([], [], "time"),
+    ):
+        left_out = decision(shares, told)
+        assert left_out.choice == "left out"
+        assert why in left_out.because

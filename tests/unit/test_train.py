@@ -356,12 +356,12 @@ def test_the_report_says_why_brightness_was_left_out() -> None:
         decision_on(limited(budget_s, steps=0), "brightness without texture") for budget_s in (None, 0.5)
     )
     assert whole.choice == stopped.choice == "left out"
-    assert "patches agree" in whole.because
+    assert "what patches agree on" in whole.because
     assert "time" in stopped.because
 
 
 def test_the_last_grid_of_a_plain_subject_is_fitted_as_such(monkeypatch: pytest.MonkeyPatch) -> None:
-    """From the grid before it hears what brightness told there, and how much of a known one is textured."""
+    """From the grid before it hears what brightness told there, and how much of the surface is textured."""
     heard: list[tuple[int, float, int]] = []
     some = torch.tensor([[0.0, 0.0, 0.5], [0.0, 0.5, 0.0]])
     places = ShownPlaces(positions=some, normals=2 * some, weights=torch.ones(2))
@@ -372,14 +372,14 @@ def test_the_last_grid_of_a_plain_subject_is_fitted_as_such(monkeypatch: pytest.
         return fit_level(scene, before, *args, **words)
 
     monkeypatch.setattr(train, "fit_level", spy)
-    monkeypatch.setattr(train, "textured", lambda scene: 0.4)
+    monkeypatch.setattr(train, "textured", lambda scene, distance: 0.25)
     config = TrainConfig(levels=(16, 20, 24, 32), rounds=(3, 3, 3, 3), steps=(0, 0, 0, 0), looks=(0, 1, 1))
     subject, unknown = (masked_scene(), true_region(), masked_stereo()), (open_scene(), ROOMY, open_stereo())
     nothing = places.chosen(places.weights < 0)
     for what, told, num, stereo in (
-        (subject, places, 2, 0.4),
+        (subject, places, 2, 0.25),
         (subject, nothing, 0, 1),
-        (unknown, places, 2, 1),
+        (unknown, places, 2, 0.25),
     ):
         monkeypatch.setattr(train, "shared_brightness", lambda scene, distance, told=told: told)
         heard.clear()
