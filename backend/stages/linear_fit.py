@@ -15,7 +15,7 @@ from ..maths.smooth_fit import fit_smooth
 from .inner_outlines import FarSide
 from .measurements import Measurements
 from .rims import RimRays, rim_points, rim_rays
-from .shared_brightness import ShownPlaces
+from .shared_brightness import MOSTLY_TEXTURED, ShownPlaces
 from .silhouettes import SilhouetteRays, inside_along, least_distance, middles, silhouette_rays
 from .unseen_side import ball_behind, depth_is_bounded
 
@@ -23,8 +23,6 @@ OrientedPoints = tuple[Float[Tensor, "points 3"], Float[Tensor, "points 3"], Flo
 """Positions, normals and weights."""
 Ask = Callable[[Float[Tensor, "nodes nodes nodes"]], ShownPlaces | None]
 """What brightness tells about a field; None if nothing, and not to be asked again."""
-_TEXTURED = 0.5
-"""Where patches tell a larger share of the surface than this, it is fitted as what is textured."""
 _FADE = 0.7
 """Share of its pull that a missed ray keeps in the next round: rays that are hit by then let go."""
 _RIM_REACH = 0.2
@@ -72,7 +70,7 @@ def for_plain(config: LinearConfig, textured: float) -> LinearConfig:
     better than their slope: at full weight each line of them is a dent in what is smooth around it. The less
     of the surface is `textured` (shared_brightness), the less they weigh.
     """
-    trusted = min(1.0, (textured / _TEXTURED) ** 2)
+    trusted = min(1.0, (textured / MOSTLY_TEXTURED) ** 2)
     return replace(
         config,
         stereo=trusted * config.stereo,

@@ -272,12 +272,12 @@ def test_lines_of_points_with_tilted_normals_dent_what_is_plain_less() -> None:
 
     usual, half, plain = (
         dents_deg(config)
-        for config in (LinearConfig(), *(for_plain(LinearConfig(), share) for share in (0.35, 0.16)))
+        for config in (LinearConfig(), *(for_plain(LinearConfig(), share) for share in (0.55, 0.25)))
     )
     assert plain < 0.8 * usual
     assert plain < half < usual
-    assert for_plain(LinearConfig(), 1.0) == LinearConfig()
-    config = for_plain(LinearConfig(), 0.16)
+    assert for_plain(LinearConfig(), 0.9) == LinearConfig()
+    config = for_plain(LinearConfig(), 0.25)
     assert dents_deg(replace(config, stereo=1.0)) > 1.1 * plain
     assert dents_deg(replace(config, smoothness=LinearConfig().smoothness)) > 1.1 * plain
 

@@ -372,7 +372,7 @@ def test_the_last_grid_of_a_plain_subject_is_fitted_as_such(monkeypatch: pytest.
         return fit_level(scene, before, *args, **words)
 
     monkeypatch.setattr(train, "fit_level", spy)
-    monkeypatch.setattr(train, "textured", lambda scene, distance: 0.25)
+    monkeypatch.setattr(train, "textured", lambda scene, distance: 0.4)
     config = TrainConfig(levels=(16, 20, 24, 32), rounds=(3, 3, 3, 3), steps=(0, 0, 0, 0), looks=(0, 1, 1))
     subject, unknown = (masked_scene(), true_region(), masked_stereo()), (open_scene(), ROOMY, open_stereo())
     nothing = places.chosen(places.weights < 0)
