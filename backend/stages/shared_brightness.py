@@ -40,7 +40,7 @@ from .measurements import SURE, Measurements
 from .seen_field import at_size, may_show, seen_field, smaller
 from .stereo_windows import neighbours
 
-MOSTLY_TEXTURED = 0.8
+MOSTLY_TEXTURED = 0.7
 """Where patches tell a larger share of the surface, what is left is hidden or beside edges."""
 _GLANCE = 0.125
 """Of the photographs' size at which that share is measured."""

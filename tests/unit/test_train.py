@@ -356,7 +356,7 @@ def test_the_report_says_why_brightness_was_left_out() -> None:
         decision_on(limited(budget_s, steps=0), "brightness without texture") for budget_s in (None, 0.5)
     )
     assert whole.choice == stopped.choice == "left out"
-    assert "what patches agree on" in whole.because
+    assert "patches tell 7" in whole.because
     assert "time" in stopped.because
 
 
@@ -372,7 +372,7 @@ def test_the_last_grid_of_a_plain_subject_is_fitted_as_such(monkeypatch: pytest.
         return fit_level(scene, before, *args, **words)
 
     monkeypatch.setattr(train, "fit_level", spy)
-    monkeypatch.setattr(train, "textured", lambda scene, distance: 0.4)
+    monkeypatch.setattr(train, "textured", lambda scene, distance: 0.35)
     config = TrainConfig(levels=(16, 20, 24, 32), rounds=(3, 3, 3, 3), steps=(0, 0, 0, 0), looks=(0, 1, 1))
     subject, unknown = (masked_scene(), true_region(), masked_stereo()), (open_scene(), ROOMY, open_stereo())
     nothing = places.chosen(places.weights < 0)
