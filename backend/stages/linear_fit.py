@@ -23,6 +23,8 @@ OrientedPoints = tuple[Float[Tensor, "points 3"], Float[Tensor, "points 3"], Flo
 """Positions, normals and weights."""
 Ask = Callable[[Float[Tensor, "nodes nodes nodes"]], ShownPlaces | None]
 """What brightness tells about a field; None if nothing, and not to be asked again."""
+_ENOUGH_TOLD = 0.07
+"""Share of the surface that brightness has to tell for it to be fitted as what is plain."""
 _FADE = 0.7
 """Share of its pull that a missed ray keeps in the next round: rays that are hit by then let go."""
 _RIM_REACH = 0.2
@@ -63,19 +65,20 @@ class LinearConfig:
     """Radius of the ball behind, in half widths of the subject; None to find it out."""
 
 
-def for_plain(config: LinearConfig, textured: float) -> LinearConfig:
+def for_plain(config: LinearConfig, textured: float, told: float) -> LinearConfig:
     """For the last grid where brightness tells what patches do not: smoother, and led by outlines.
 
     Patches that agree where there is little texture are few, lie along edges of paint, and know their depth
     better than their slope: at full weight each line of them is a dent in what is smooth around it. The less
-    of the surface is `textured` (shared_brightness), the less they weigh.
+    of the surface is `textured`, the less they weigh, if brightness has `told` enough (both of
+    shared_brightness): else what patches do not tell is not plain but narrow, or faint.
     """
-    trusted = min(1.0, (textured / MOSTLY_TEXTURED) ** 2)
+    plain = (1 - min(1.0, textured / MOSTLY_TEXTURED) ** 2) * min(1.0, told / _ENOUGH_TOLD)
     return replace(
         config,
-        stereo=trusted * config.stereo,
-        smoothness=(2 - trusted) * config.smoothness,
-        rims=(3 - 2 * trusted) * config.rims,
+        stereo=(1 - plain) * config.stereo,
+        smoothness=(1 + plain) * config.smoothness,
+        rims=(1 + 2 * plain) * config.rims,
     )
 
 

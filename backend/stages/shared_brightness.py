@@ -124,6 +124,14 @@ def textured(scene: Measurements, distance: Float[Tensor, "nodes nodes nodes"]) 
     return float(torch.cat(told).mean().nan_to_num())
 
 
+def share_told(told: ShownPlaces, distance: Float[Tensor, "nodes nodes nodes"]) -> float:
+    """Of the cells that a field's surface goes through, about how many have places that were told."""
+    h = spacing(len(distance))
+    # a plane goes through |n_x| + |n_y| + |n_z| cells for each square of a cell's side: on average 1.5
+    met = int((distance.abs() < 0.75 * h).sum())
+    return len(torch.unique(cube_keys(told.positions, h))) / max(met, 1)
+
+
 def decision(shares: Sequence[float], shown: Sequence[ShownPlaces]) -> Decision:
     """What it was worth in a fit's passes, for the report; `shares` are `textured` on its grids."""
     what, count = "brightness without texture", max((len(s.weights) for s in shown), default=0)

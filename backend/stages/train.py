@@ -21,7 +21,7 @@ from .linear_fit import Ask, LinearConfig, fit_level, for_plain, start
 from .measurements import Measurements, carried, measurements
 from .render_fit import RenderConfig, refine
 from .safe_steps import not_finite
-from .shared_brightness import MOSTLY_TEXTURED, ShownPlaces, shared_brightness, textured
+from .shared_brightness import MOSTLY_TEXTURED, ShownPlaces, share_told, shared_brightness, textured
 from .shared_brightness import decision as of_brightness
 from .surface import COARSEST, ShowSurface, Surface, show_nothing, tight_frame
 from .unseen_depth import depth_behind
@@ -143,7 +143,9 @@ def _by_texture(
     if not config.linear.brightness or not looks:
         return config.linear, 0
     shares.append(textured(scene, before))
-    linear = config.linear if told is None or not is_last else for_plain(config.linear, shares[-1])
+    linear = config.linear
+    if told is not None and is_last:
+        linear = for_plain(linear, shares[-1], share_told(told, before))
     return linear, looks if shares[-1] <= MOSTLY_TEXTURED else 0
 
 

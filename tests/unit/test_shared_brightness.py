@@ -15,7 +15,7 @@ from backend.maths.srgb import srgb_from_linear
 from backend.stages import shared_brightness as stage
 from backend.stages.linear_fit import LinearConfig, ask_nothing, fit_level, for_plain
 from backend.stages.measurements import SURE, Measurements
-from backend.stages.shared_brightness import ShownPlaces, decision, shared_brightness, textured
+from backend.stages.shared_brightness import ShownPlaces, decision, share_told, shared_brightness, textured
 
 NODES, SIZE, RADIUS = 64, 320, 0.6
 TOO_LARGE = 0.03
@@ -235,6 +235,16 @@ def test_patches_are_textured_by_their_share_of_the_surface(subject_known: bool)
     assert [share(y) for y in (-RADIUS, 0.0, RADIUS)] == pytest.approx([0.0, 0.5, 1.0], abs=0.03)
 
 
+def test_brightness_tells_a_share_of_the_surface_cell_by_cell() -> None:
+    """Places all over a part of the ball, many in a cell."""
+    torch.manual_seed(0)
+    ball = RADIUS * F.normalize(torch.randn(200_000, 3), dim=-1)
+    for height, share in ((-1.0, 1.0), (0.0, 0.5), (0.5 * RADIUS, 0.25)):
+        told = ball[ball[:, 1] > height]
+        places = ShownPlaces(positions=told, normals=told, weights=torch.ones(len(told)))
+        assert share_told(places, too_large(0.0)) == pytest.approx(share, abs=0.03 + 0.1 * share)
+
+
 def test_patches_that_are_not_sure_tell_less_of_the_surface() -> None:
     ball = scene(known_up_to=RADIUS)
     faint = replace(ball, confidences=[0.1 * (c > 0) for c in ball.confidences])
@@ -243,6 +253,19 @@ def test_patches_that_are_not_sure_tell_less_of_the_surface() -> None:
 
 def test_a_field_that_no_photograph_shows_has_no_texture() -> None:
     assert textured(scene(), torch.ones(NODES, NODES, NODES)) == 0
+
+
+@pytest.mark.parametrize(
+    ("textured", "told", "plain"), [(0.0, 1.0, 1.0), (0.0, 0.035, 0.5), (0.35, 1.0, 0.75)]
+)
+def test_stereo_gives_way_to_smoothness_and_rims_by_what_is_plain(
+    textured: float, told: float, plain: float
+) -> None:
+    usual = LinearConfig()
+    changed = for_plain(usual, textured, told)
+    assert changed.stereo == pytest.approx((1 - plain) * usual.stereo)
+    assert changed.smoothness == pytest.approx((1 + plain) * usual.smoothness)
+    assert changed.rims == pytest.approx((1 + 2 * plain) * usual.rims)
 
 
 def test_lines_of_points_with_tilted_normals_dent_what_is_plain_less() -> None:
@@ -272,12 +295,12 @@ def test_lines_of_points_with_tilted_normals_dent_what_is_plain_less() -> None:
 
     usual, half, plain = (
         dents_deg(config)
-        for config in (LinearConfig(), *(for_plain(LinearConfig(), share) for share in (0.55, 0.25)))
+        for config in (LinearConfig(), *(for_plain(LinearConfig(), share, 1.0) for share in (0.55, 0.25)))
     )
     assert plain < 0.8 * usual
     assert plain < half < usual
-    assert for_plain(LinearConfig(), 0.9) == LinearConfig()
-    config = for_plain(LinearConfig(), 0.25)
+    assert for_plain(LinearConfig(), 0.9, 1.0) == for_plain(LinearConfig(), 0.2, 0.0) == LinearConfig()
+    config = for_plain(LinearConfig(), 0.25, 1.0)
     assert dents_deg(replace(config, stereo=1.0)) > 1.1 * plain
     assert dents_deg(replace(config, smoothness=LinearConfig().smoothness)) > 1.1 * plain
 

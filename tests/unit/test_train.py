@@ -373,13 +373,14 @@ def test_the_last_grid_of_a_plain_subject_is_fitted_as_such(monkeypatch: pytest.
 
     monkeypatch.setattr(train, "fit_level", spy)
     monkeypatch.setattr(train, "textured", lambda scene, distance: 0.35)
+    monkeypatch.setattr(train, "share_told", lambda told, distance: 0.035)
     config = TrainConfig(levels=(16, 20, 24, 32), rounds=(3, 3, 3, 3), steps=(0, 0, 0, 0), looks=(0, 1, 1))
     subject, unknown = (masked_scene(), true_region(), masked_stereo()), (open_scene(), ROOMY, open_stereo())
     nothing = places.chosen(places.weights < 0)
     for what, told, num, stereo in (
-        (subject, places, 2, 0.25),
+        (subject, places, 2, 1 - 0.75 * 0.5),
         (subject, nothing, 0, 1),
-        (unknown, places, 2, 0.25),
+        (unknown, places, 2, 1 - 0.75 * 0.5),
     ):
         monkeypatch.setattr(train, "shared_brightness", lambda scene, distance, told=told: told)
         heard.clear()
