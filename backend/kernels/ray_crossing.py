@@ -11,8 +11,10 @@ from .compiled import HALF, ONE, ZERO, Floats, compiled
 
 Flags = NDArray[np.bool_]
 
-_CAUTION = np.float32(0.95)
-_TINY = np.float32(1e-9)
+CAUTION = np.float32(0.95)
+"""Share of the distance that a step goes."""
+TINY = np.float32(1e-9)
+"""Least difference of two distances that the crossing between them is found by."""
 
 
 @compiled
@@ -65,7 +67,7 @@ def first_crossings(
         for _ in range(limits[3]):
             here = read(grid, a + at * d, b + at * e, c + at * f)
             if here <= ZERO:
-                share = before / max(before - here, _TINY) if before < np.inf else ONE
+                share = before / max(before - here, TINY) if before < np.inf else ONE
                 place, met = last + share * (at - last), True
                 break
             if here < nearest:
@@ -73,7 +75,7 @@ def first_crossings(
             if not at < end:
                 break
             before, last = here, at
-            at = min(at + min(max(_CAUTION * here, shortest), longest), end)
+            at = min(at + min(max(CAUTION * here, shortest), longest), end)
         along[ray], hit[ray] = place, met
 
 

@@ -161,11 +161,11 @@ def _traced(rays: _Rays, distance: DistanceFunction, shortest: float, longest: f
     here = distance(rays.origins + along[:, None] * rays.directions)
     closer = (here < rays.nearest) & ~rays.met
     new = (here <= 0) & ~rays.met
-    share = torch.where(before.isfinite(), before / (before - here).clamp(min=1e-9), 1.0)
+    share = torch.where(before.isfinite(), before / (before - here).clamp(min=float(ray_crossing.TINY)), 1.0)
     at = torch.where(closer, along, rays.at)
     return replace(
         rays,
-        along=(along + (0.95 * here).clamp(shortest, longest)).minimum(rays.end),
+        along=(along + (float(ray_crossing.CAUTION) * here).clamp(shortest, longest)).minimum(rays.end),
         last=along,
         before=here,
         nearest=torch.where(closer, here, rays.nearest),
