@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 import torch
@@ -57,7 +58,7 @@ def sphere_span(
 
 
 def first_crossing(
-    distance: DistanceFunction,
+    distance: DistanceFunction | Float[Tensor, "nodes nodes nodes"],
     origins: Float[Tensor, "rays 3"],
     directions: Float[Tensor, "rays 3"],
     start: Float[Tensor, "rays"],
@@ -75,7 +76,16 @@ def first_crossing(
 
     A ray that never meets the surface gets the place where it came nearest, so that the silhouette
     can be moved towards or away from it. Rays end `reach` after their start.
+
+    A grid is trilinear on the cube [-1, 1]^3 and goes on as it is at its sides. On the CPU and in single
+    precision it is compiled (`kernels/ray_crossing.py`); what it is as a function of `grid.read` is the
+    reference, and what a GPU runs.
     """
+    if isinstance(distance, Tensor):
+        grid = distance
+        if grid.device.type == "cpu" and grid.dtype == torch.float32:
+            return _compiled_crossing(grid, origins, directions, start, (reach, shortest, longest, steps))
+        distance = partial(read, grid)
     place, hit = start.clone(), torch.zeros_like(start, dtype=torch.bool)
     nowhere = start + torch.inf
     rays = _Rays(
@@ -98,36 +108,19 @@ def first_crossing(
     return Crossing(along=place, hit=hit)
 
 
-def first_crossing_on_grid(
-    distance: Float[Tensor, "nodes nodes nodes"],
+def _compiled_crossing(
+    grid: Float[Tensor, "nodes nodes nodes"],
     origins: Float[Tensor, "rays 3"],
     directions: Float[Tensor, "rays 3"],
     start: Float[Tensor, "rays"],
-    *,
-    reach: float = 2.0,
-    shortest: float = 0.005,
-    longest: float = 0.1,
-    steps: int = 40,
+    limits: tuple[float, float, float, int],
 ) -> Crossing:
-    """`first_crossing` of a trilinear field on the cube [-1, 1]^3, which goes on as it is at its sides."""
-    if distance.device.type != "cpu" or distance.dtype != torch.float32:
-        return first_crossing(
-            lambda points: read(distance, points),
-            origins,
-            directions,
-            start,
-            reach=reach,
-            shortest=shortest,
-            longest=longest,
-            steps=steps,
-        )
     along, hit = np.empty(len(start), np.float32), np.empty(len(start), np.bool_)
-    grid, limits = floats(distance), (reach, shortest, longest, steps)
-    rays = floats(origins), floats(directions), floats(start)
+    field, rays = floats(grid), (floats(origins), floats(directions), floats(start))
 
     def trace(first: int) -> None:
         rows = (first, min(first + _RAYS_IN_ONE_GO, len(along)))
-        ray_crossing.first_crossings(rows, grid, *rays, limits, along, hit)
+        ray_crossing.first_crossings(rows, field, *rays, limits, along, hit)
 
     side_by_side(trace, range(0, len(along), _RAYS_IN_ONE_GO), torch.get_num_threads())
     return Crossing(along=torch.from_numpy(along), hit=torch.from_numpy(hit))

@@ -14,7 +14,7 @@ from torch import Tensor
 from ..maths import losses
 from ..maths.grid import laplacian_at, spacing, splat
 from ..maths.radiance import mean_colour
-from ..maths.rays import first_crossing_on_grid, points_along, sphere_entry
+from ..maths.rays import first_crossing, points_along, sphere_entry
 from ..maths.volume import log_transmittance, log_transparency
 from ..scene import Progress
 from .deadline import Deadline
@@ -121,7 +121,7 @@ def _ray_loss(
     origins, directions = rays_through(scene.cameras, pixels, chosen)
     with torch.no_grad():
         entry = sphere_entry(origins, directions)
-        crossing = first_crossing_on_grid(whole, origins, directions, entry)
+        crossing = first_crossing(whole, origins, directions, entry)
     h = spacing(field.nodes)
     spread = torch.linspace(-3, 3, config.edges, device=origins.device)
     jitter = torch.rand((config.rays, 1), generator=generator).to(origins.device) - 0.5

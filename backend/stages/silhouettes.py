@@ -10,7 +10,7 @@ from torch import Tensor
 from ..maths.evidence import half_cell_px, off_silhouette
 from ..maths.geometry import Pinhole, ray_directions
 from ..maths.grid import node_positions, read, spacing
-from ..maths.rays import Crossing, first_crossing_on_grid, points_along, sphere_entry, sphere_span
+from ..maths.rays import Crossing, first_crossing, points_along, sphere_entry, sphere_span
 from ..maths.rows import Rows
 from .measurements import Measurements
 
@@ -129,7 +129,7 @@ def grid_crossing(
     entry: Float[Tensor, "rays"],
 ) -> Crossing:
     """Where rays meet a field on the grid, from their `grid_entry` on, in steps of half a cell and more."""
-    return first_crossing_on_grid(
+    return first_crossing(
         distance,
         origins,
         directions,

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from backend.maths.grid import node_positions, read
-from backend.maths.rays import first_crossing, first_crossing_on_grid, sphere_entry
+from backend.maths.rays import first_crossing, sphere_entry
 
 RADIUS = 0.5
 
@@ -133,9 +133,9 @@ def test_compiled_tracing_is_the_same_as_in_torch(scale: float) -> None:
     start = torch.zeros(len(origins))
     limits = {"reach": scale + 1.5, "shortest": 0.03, "longest": 0.2, "steps": 50}
     expected = first_crossing(lambda at: read(field, at), origins, directions, start, **limits)
-    single = first_crossing_on_grid(field, origins, directions, start, **limits)
+    single = first_crossing(field, origins, directions, start, **limits)
     rays = (values.double() for values in (field, origins, directions, start))
-    double = first_crossing_on_grid(*rays, **limits)
+    double = first_crossing(*rays, **limits)
     assert expected.hit.sum() > 1000
     assert double.along.dtype == torch.float64
     for found in (single, double):
@@ -156,9 +156,9 @@ def test_compiled_tracing_is_the_same_on_any_number_of_threads(
 ) -> None:
     origins, directions = rays_towards(20_000, 0.9)
     start, field = sphere_entry(origins, directions), wavy_field(33)
-    expected = first_crossing_on_grid(field, origins, directions, start)
+    expected = first_crossing(field, origins, directions, start)
     monkeypatch.setattr(torch, "get_num_threads", lambda: threads)
-    found = first_crossing_on_grid(field, origins, directions, start)
+    found = first_crossing(field, origins, directions, start)
     assert torch.equal(found.along, expected.along)
     assert torch.equal(found.hit, expected.hit)
 
@@ -169,9 +169,9 @@ def test_compiled_tracing_stays_in_the_grid_whatever_it_is_given(number: float) 
     field = wavy_field(9)
     broken = torch.full_like(origins, number)
     for rays in ((broken, directions), (origins, broken)):
-        found = first_crossing_on_grid(field, *rays, torch.zeros(30))
+        found = first_crossing(field, *rays, torch.zeros(30))
         assert found.along.isfinite().all()
-    without = first_crossing_on_grid(torch.full_like(field, math.nan), origins, directions, torch.ones(30))
+    without = first_crossing(torch.full_like(field, math.nan), origins, directions, torch.ones(30))
     assert (without.along == 1).all()
     assert not without.hit.any()
-    assert first_crossing_on_grid(field, origins[:0], directions[:0], torch.zeros(0)).hit.shape == (0,)
+    assert first_crossing(field, origins[:0], directions[:0], torch.zeros(0)).hit.shape == (0,)
