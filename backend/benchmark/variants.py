@@ -69,6 +69,7 @@ VARIANTS = (
     ),
     Variant(name="without outlines inside the subject", changes={"train.linear.inner_outlines": False}),
     Variant(name="without brightness", changes={"train.linear.brightness": 0.0}),
+    Variant(name="what shines taken as matt", changes={"train.linear.may_shine": False}),
     Variant(
         name="without any free space",
         changes={
@@ -116,6 +117,7 @@ VARIANTS = (
         preset="fast",
     ),
     Variant(name="fast, without brightness", changes={"train.linear.brightness": 0.0}, preset="fast"),
+    Variant(name="fast, what shines taken as matt", changes={"train.linear.may_shine": False}, preset="fast"),
     Variant(name="fast at full size", changes={"stereo.first_pixel_size": 1}, preset="fast"),
     # what SparseCraft asks of points
     Variant(name="sparsecraft, 400 steps", changes=_SHORT, preset="sparsecraft"),

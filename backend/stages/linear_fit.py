@@ -45,6 +45,8 @@ class LinearConfig:
     """Whether bridges are looked for where photographs show that one part hides another."""
     brightness: float = 1.0
     """Of places that brightness tells where no texture does; 0 not to look for any."""
+    may_shine: bool = True
+    """Whether light that a thing is found to mirror is taken off the photographs for that."""
     silhouettes: float = 0.2
     """On rays through the subject that miss the field."""
     rims: float = 0.2

@@ -7,7 +7,8 @@ what they show changes evenly along the rays, the depth at which both show the s
 
 How far it can be trusted is measured twice: by what differs where patches do agree, averaged over so many
 places that their texture evens out (on what shines, brightness depends on the view, and the average shows
-it); and by what one step leaves unexplained in a window (texture, edges, something else in front).
+it); and by what one step leaves unexplained in a window (texture, edges, something else in front). Of what
+shines, the part that mirrored directions explain is taken off before (shine).
 """
 
 import math
@@ -22,7 +23,6 @@ from scipy.ndimage import binary_erosion, gaussian_filter
 from torch import Tensor
 
 from ..maths.brightness import (
-    SIGMA_OF_MEDIAN_DEVIATION,
     Slopes,
     channels_of,
     depth_steps,
@@ -33,11 +33,13 @@ from ..maths.brightness import (
 from ..maths.evidence import cube_keys
 from ..maths.geometry import Pinhole, project, sample_image
 from ..maths.grid import spacing
+from ..maths.mirrored_light import means_of_bins, mirrored_bins
 from ..maths.rows import Rows
 from ..maths.srgb import linear_from_srgb
 from ..scene import Decision
 from .measurements import SURE, Measurements
 from .seen_field import at_size, may_show, seen_field, smaller
+from .shine import Boxes, Shine, deviations, mirrored_by, together
 from .stereo_windows import neighbours
 
 MOSTLY_TEXTURED = 0.7
@@ -72,9 +74,7 @@ _LONGEST_CELLS = 4.0
 _CELL = 6.0
 """Side of a box, in cells of the grid, over which differences are averaged."""
 _FEWEST_IN_BOX = 20
-"""Places in it that patches agree on."""
-_LEAST_DIFFERENCE = 0.001
-"""Between photographs, in linear light: a third of eight bits' step."""
+"""Places in it, all of which patches agree on, or none."""
 _SURE_DEVIATION = 0.002
 """Of the depth of a sure stereo point, in half widths of the grid; what is as good weighs as much."""
 _LARGEST_DEVIATION = 0.02
@@ -89,10 +89,17 @@ class ShownPlaces(Rows):
     normals: Float[Tensor, "points 3"]
     weights: Float[Tensor, "points"]
     """Beside a sure stereo point, 0 to 1."""
+    mirrored: Float[Tensor, "points"]
+    """Difference of brightness, in linear light, that was taken off because it is mirrored light."""
 
 
-def shared_brightness(scene: Measurements, distance: Float[Tensor, "nodes nodes nodes"]) -> ShownPlaces:
-    """Where the field's surface should be, of all places that two photographs see and patches do not tell."""
+def shared_brightness(
+    scene: Measurements, distance: Float[Tensor, "nodes nodes nodes"], *, may_shine: bool = True
+) -> ShownPlaces:
+    """Where the field's surface should be, of all places that two photographs see and patches do not tell.
+
+    If it `may_shine`, light that it is found to mirror is taken off first.
+    """
     pictures = [_picture(scene, index, distance) for index in range(len(scene.cameras))]
     partners = neighbours(scene.cameras, _PARTNERS)
     compared = [
@@ -103,11 +110,10 @@ def shared_brightness(scene: Measurements, distance: Float[Tensor, "nodes nodes 
     ]
     if not compared:
         return _together([])
-    differences = torch.cat([pair.differences for pair in compared], dim=1)
-    by_view = (SIGMA_OF_MEDIAN_DEVIATION * differences.abs().median(dim=1).values).clamp(
-        min=_LEAST_DIFFERENCE
-    )
-    return _off_outlines(scene, _together([_told(pair, by_view) for pair in compared]))
+    boxes = together([pair.boxes for pair in compared])
+    noise = deviations(boxes.difference[:, boxes.sure])
+    shine = mirrored_by(boxes, noise, compared[0].cell) if may_shine else None
+    return _off_outlines(scene, _together([_told(pair, noise, shine) for pair in compared]))
 
 
 def textured(scene: Measurements, distance: Float[Tensor, "nodes nodes nodes"]) -> float:
@@ -137,6 +143,8 @@ def decision(shares: Sequence[float], shown: Sequence[ShownPlaces]) -> Decision:
     what, count = "brightness without texture", max((len(s.weights) for s in shown), default=0)
     if count:
         because = f"the same from two sides, it tells the depth of {count} places that no texture tells"
+        if (most := max(float(s.mirrored.max()) for s in shown if len(s.mirrored))) > 0:
+            because += f"; it shines, and what it mirrors, up to {most:.1%} of white, is taken off"
     elif shown:
         because = "what patches agree on is not equally bright, or too little to tell"
     elif shares and shares[-1] > MOSTLY_TEXTURED:
@@ -177,13 +185,15 @@ class _Picture:
 class _Compared:
     """What two photographs show of the same places, by channels: brightness and differences of colour."""
 
-    differences: Float[Tensor, "channels boxes"]
-    """Where patches agree, averaged."""
+    boxes: Boxes
+    """Averages; some of them where patches agree."""
     places: _Places
     """Where patches do not."""
     difference: Float[Tensor, "channels height width"]
     slopes: Slopes
     """Of them, [channels, height, width]; straight nowhere but at the places that both show."""
+    bins: Int64[Tensor, "2 height width"]
+    """Of the mirrored directions, from the one's side and the other's."""
     cell: float
     """Side of a cell of the grid."""
 
@@ -255,25 +265,43 @@ def _compared(one: _Picture, other: _Picture, nodes: int) -> _Compared | None:
         return empty.index_copy_(1, places.pixel, values).view(-1, one.camera.height, one.camera.width)
 
     here, there = channels_of(one.linear.flatten(1)[:, places.pixel]), shown_at(at[same])
-    _, box = torch.unique(cube_keys(places.positions[sure], _CELL * h), return_inverse=True)
-    box_here, box_there = (means_of_cells(values[:, sure], box, _FEWEST_IN_BOX) for values in (here, there))
-    if not box_here.shape[1]:
+    _, box = torch.unique(2 * cube_keys(places.positions, _CELL * h) + sure.long(), return_inverse=True)
+
+    def boxes(values: Float[Tensor, "channels places"]) -> Float[Tensor, "channels boxes"]:
+        return means_of_cells(values, box, _FEWEST_IN_BOX)
+
+    in_sure = boxes(sure[None].float())[0] > 0.5
+    if not in_sure.any():
         return None
-    ratio = exposure_ratio(box_here, box_there)[:, None]
-    along = slopes_along(shown(-h), there, shown(h), h)
+    ratio = exposure_ratio(boxes(here)[:, in_sure], boxes(there)[:, in_sure])[:, None]
+    difference, along = ratio * here - there, slopes_along(shown(-h), there, shown(h), h)
+    bins = torch.stack(
+        [
+            mirrored_bins(places.normals, F.normalize(camera.position - places.positions, dim=-1))
+            for camera in (one.camera, other.camera)
+        ]
+    )
     return _Compared(
-        differences=ratio * box_here - box_there,
+        boxes=Boxes(
+            difference=boxes(difference),
+            slope=boxes(along.slope),
+            rows=means_of_bins(bins[0], bins[1], box)[torch.bincount(box) >= _FEWEST_IN_BOX],
+            sure=in_sure,
+        ),
         places=places.chosen(~sure),
-        difference=in_picture(ratio * here - there),
+        difference=in_picture(difference),
         slopes=Slopes(slope=in_picture(along.slope), straight=in_picture(along.straight)),
+        bins=in_picture(bins),
         cell=h,
     )
 
 
-def _told(pair: _Compared, by_view: Float[Tensor, "channels"]) -> ShownPlaces:
+def _told(pair: _Compared, matt_noise: Float[Tensor, "channels"], shine: Shine | None) -> ShownPlaces:
     """The places that are told well enough, by how much each channel depends on the view."""
-    noise, straight = by_view[:, None, None], pair.slopes.straight
-    difference, slope = pair.difference / noise, pair.slopes.slope / noise
+    matt, noise = pair.difference, matt_noise[:, None, None]
+    if shine is not None:
+        matt, noise = shine.taken_off(pair.difference, pair.bins)
+    straight, difference, slope = pair.slopes.straight, matt / noise, pair.slopes.slope / noise
     steps = depth_steps(difference, slope, straight, _WINDOW_PX)
     around = depth_steps(difference, slope, straight, _WIDE_PX)
     deviation = (steps.left_over.square() + 1).sqrt() / steps.slope
@@ -286,6 +314,7 @@ def _told(pair: _Compared, by_view: Float[Tensor, "channels"]) -> ShownPlaces:
         positions=places.positions + step[:, None] * places.directions,
         normals=places.normals,
         weights=(_SURE_DEVIATION / deviation).square().clamp(max=1.0),
+        mirrored=(pair.difference - matt)[0].flatten()[places.pixel].abs(),
     )
 
 
@@ -302,9 +331,11 @@ def _off_outlines(scene: Measurements, shown: ShownPlaces) -> ShownPlaces:
 def _together(parts: Sequence[ShownPlaces]) -> ShownPlaces:
     nothing = torch.zeros((0, 3))
     if not parts:
-        return ShownPlaces(positions=nothing, normals=nothing, weights=nothing[:, 0])
+        none = nothing[:, 0]
+        return ShownPlaces(positions=nothing, normals=nothing, weights=none, mirrored=none)
     return ShownPlaces(
         positions=torch.cat([part.positions for part in parts]),
         normals=torch.cat([part.normals for part in parts]),
         weights=torch.cat([part.weights for part in parts]),
+        mirrored=torch.cat([part.mirrored for part in parts]),
     )

@@ -97,7 +97,7 @@ def fit_surface(
             so_far = _told_last(shown)
             linear, looks = _by_texture(config, level, scene, before, so_far, shares)
             tell = within(progress, done / total, (done + 10) / total)
-            ask = _asking(scene, shown, looks, deadline, began_s, tell)
+            ask = _asking(scene, config.linear, shown, looks, deadline, began_s, tell)
             distance = fit_level(
                 scene, before, radius, rounds, linear, far=far, told=so_far, ask=ask, looks=looks
             )
@@ -151,6 +151,7 @@ def _by_texture(
 
 def _asking(
     scene: Measurements,
+    config: LinearConfig,
     shown: list[ShownPlaces],
     looks: int,
     deadline: Deadline,
@@ -165,7 +166,7 @@ def _asking(
         if deadline.left_s() < deadline.clock() - began_s:
             return None
         progress((len(shown) - before) / looks, "looking where photographs are equally bright")
-        shown.append(shared_brightness(scene, distance))
+        shown.append(shared_brightness(scene, distance, may_shine=config.may_shine))
         return _told_last(shown)
 
     return ask

@@ -11,15 +11,19 @@ from torch import Tensor
 
 from backend.maths.geometry import Pinhole, pixel_centres, project, ray_directions, unproject
 from backend.maths.grid import locate, node_positions, read, spacing, value_and_gradient
+from backend.maths.mirrored_light import BINS
 from backend.maths.srgb import srgb_from_linear
 from backend.stages import shared_brightness as stage
 from backend.stages.linear_fit import LinearConfig, ask_nothing, fit_level, for_plain
 from backend.stages.measurements import SURE, Measurements
 from backend.stages.shared_brightness import ShownPlaces, decision, share_told, shared_brightness, textured
+from backend.stages.shine import Boxes, deviations, mirrored_by
 
 NODES, SIZE, RADIUS = 64, 320, 0.6
 TOO_LARGE = 0.03
 """By how much the field is, above: about a cell."""
+SHARPNESS = 2
+"""Of what it mirrors of the light: Phong's exponent."""
 LIGHT = F.normalize(torch.tensor([1.0, 0.7, -0.5]), dim=0)
 
 Field = Float[Tensor, "nodes nodes nodes"]
@@ -63,9 +67,9 @@ def scene(
         normals = points / RADIUS
         matt = 0.05 + 0.6 * (normals @ LIGHT).clamp(min=0)
         to_camera = F.normalize(one.position - points, dim=-1)
-        halfway = F.normalize(to_camera + LIGHT, dim=-1)
+        mirrored = 2 * (normals * to_camera).sum(-1, keepdim=True) * normals - to_camera
         light = matt * torch.tensor(colour)[:, None, None]
-        light = light + shine * (normals * halfway).sum(-1).clamp(min=0) ** 4
+        light = light + shine * (mirrored @ LIGHT).clamp(min=0) ** SHARPNESS
         srgb = srgb_from_linear((light * (exposure if index else 1.0)).clamp(max=1).numpy())
         images.append(torch.where(on, torch.tensor(srgb, dtype=torch.float32), 0.0))
         outlines.append(torch.where(on, -5.0, 5.0))
@@ -131,6 +135,35 @@ def test_colour_tells_what_shine_hides() -> None:
     )
     assert error(red[red[:, 1] > 0.1]) < 0.1 * TOO_LARGE
     assert error(red[red[:, 1] > 0.1]) < 0.2 * error(grey[grey[:, 1] > 0.1])
+
+
+def test_what_shines_has_what_it_mirrors_taken_off() -> None:
+    """Red tells the place better for it; grey, of which little is left to tell by, is believed less."""
+    red, grey = (scene(shine=0.05, colour=colour) for colour in ((1.0, 0.3, 0.2), (1.0, 1.0, 1.0)))
+    told, as_matt = (shared_brightness(red, too_large(), may_shine=may) for may in (True, False))
+    assert float(told.mirrored.max()) > 0.01
+    assert float(as_matt.mirrored.max()) == 0
+    assert len(told.weights) > 1.3 * len(as_matt.weights)
+    assert error(told.positions) < 0.5 * error(as_matt.positions)
+    told, as_matt = (shared_brightness(grey, too_large(), may_shine=may) for may in (True, False))
+    assert error(told.positions) < error(as_matt.positions)
+    assert float(told.weights.sum()) < 0.3 * float(as_matt.weights.sum())
+
+
+def test_what_is_matt_is_left_as_it_is() -> None:
+    matt = scene()
+    told, as_matt = (vars(shared_brightness(matt, too_large(), may_shine=may)) for may in (True, False))
+    torch.testing.assert_close(told, as_matt, rtol=0, atol=0)
+
+
+def test_nobody_shines_of_whom_patches_tell_everything() -> None:
+    """Nothing is left that mirrored light could be fitted to."""
+    generator = torch.Generator().manual_seed(0)
+    rows = torch.randn(60, BINS, generator=generator)
+    difference = torch.randn(3, 60, generator=generator)
+    sure = torch.ones(60, dtype=torch.bool)
+    boxes = Boxes(difference=difference, slope=torch.zeros_like(difference), rows=rows, sure=sure)
+    assert mirrored_by(boxes, deviations(difference), 0.03) is None
 
 
 def test_pictures_of_much_are_looked_at_smaller(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -241,7 +274,9 @@ def test_brightness_tells_a_share_of_the_surface_cell_by_cell() -> None:
     ball = RADIUS * F.normalize(torch.randn(200_000, 3), dim=-1)
     for height, share in ((-1.0, 1.0), (0.0, 0.5), (0.5 * RADIUS, 0.25)):
         told = ball[ball[:, 1] > height]
-        places = ShownPlaces(positions=told, normals=told, weights=torch.ones(len(told)))
+        places = ShownPlaces(
+            positions=told, normals=told, weights=torch.ones(len(told)), mirrored=torch.zeros(len(told))
+        )
         assert share_told(places, too_large(0.0)) == pytest.approx(share, abs=0.03 + 0.1 * share)
 
 
@@ -354,6 +389,9 @@ def test_the_report_says_what_it_was_worth() -> None:
     used = decision([0.5], [shown, nothing])
     assert used.choice == "used"
     assert str(len(shown.weights)) in used.because
+    assert "shines" not in used.because
+    shining = replace(shown, mirrored=torch.full_like(shown.mirrored, 0.021))
+    assert "2.1%" in decision([0.5], [nothing, shining]).because
     for shares, told, why in (
         ([0.5], [nothing], "too little"),
         ([0.5, 0.93], [], "93%"),

@@ -364,7 +364,7 @@ def test_the_last_grid_of_a_plain_subject_is_fitted_as_such(monkeypatch: pytest.
     """From the grid before it hears what brightness told there, and how much of the surface is textured."""
     heard: list[tuple[int, float, int]] = []
     some = torch.tensor([[0.0, 0.0, 0.5], [0.0, 0.5, 0.0]])
-    places = ShownPlaces(positions=some, normals=2 * some, weights=torch.ones(2))
+    places = ShownPlaces(positions=some, normals=2 * some, weights=torch.ones(2), mirrored=torch.zeros(2))
 
     def spy(scene: Measurements, before: torch.Tensor, *args: Any, **words: Any) -> torch.Tensor:
         told = words.get("told")
@@ -382,7 +382,7 @@ def test_the_last_grid_of_a_plain_subject_is_fitted_as_such(monkeypatch: pytest.
         (subject, nothing, 0, 1),
         (unknown, places, 2, 1 - 0.75 * 0.5),
     ):
-        monkeypatch.setattr(train, "shared_brightness", lambda scene, distance, told=told: told)
+        monkeypatch.setattr(train, "shared_brightness", lambda *field, told=told, **how: told)
         heard.clear()
         fitted(*what, config)
         assert heard[-4:] == [(16, 1.0, 0), (20, 1.0, 0), (24, 1.0, num), (32, stereo, num)]
