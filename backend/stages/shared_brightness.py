@@ -30,6 +30,7 @@ from ..maths.brightness import (
     means_of_cells,
     slopes_along,
 )
+from ..maths.correlation import window_sum
 from ..maths.evidence import cube_keys
 from ..maths.geometry import Pinhole, project, sample_image
 from ..maths.grid import spacing
@@ -57,6 +58,8 @@ _BLUR_PX = 1.0
 _MARGIN_PX = 3
 """From where the field is missed or turns away: across that the blur would reach, and beside it is what one
 photograph sees and the other does not."""
+_EVEN_PX = 2
+"""Half the side of a window over which normals are evened out."""
 _OUTLINE_PX = 4.0
 """From the subject's outline in any of the photographs."""
 _WINDOW_PX = 1
@@ -162,6 +165,7 @@ class _Places(Rows):
     """Number of the pixel, row by row."""
     positions: Float[Tensor, "places 3"]
     normals: Float[Tensor, "places 3"]
+    """Evened out."""
     directions: Float[Tensor, "places 3"]
     """Away from the camera."""
     sure: Bool[Tensor, "places"]
@@ -215,7 +219,7 @@ def _picture(scene: Measurements, index: int, distance: Float[Tensor, "nodes nod
         places=_Places(
             pixel=torch.nonzero(asked.flatten())[wanted, 0],
             positions=seen.positions[wanted],
-            normals=seen.normals[wanted],
+            normals=_evened(seen.normals[wanted], inner),
             directions=seen.directions[wanted],
             sure=(at_size(scene.confidences[index], camera) > SURE)[asked][wanted],
         ),
@@ -228,6 +232,15 @@ def _asked(
     """A camera of so much of a photograph's size, and its pixels on the subject that may show the field."""
     camera, subject = smaller(scene.cameras[index], share), scene.certain[index]
     return camera, may_show(camera, distance) if subject is None else at_size(subject, camera) < 0
+
+
+def _evened(
+    normals: Float[Tensor, "places 3"], where: Bool[Tensor, "height width"]
+) -> Float[Tensor, "places 3"]:
+    """Means over windows of the pixels `where` they are known: else ripples of the field are told again."""
+    picture = normals.new_zeros((3, *where.shape))
+    picture[:, where] = normals.T
+    return F.normalize(window_sum(picture, _EVEN_PX)[:, where].T, dim=-1)
 
 
 def _blurred(

@@ -111,6 +111,18 @@ def test_places_are_told_where_nothing_was_measured(exposure: float) -> None:
     torch.testing.assert_close(shown.normals.norm(dim=-1), torch.ones(len(shown.normals)))
 
 
+def test_ripples_of_a_field_are_not_told_again() -> None:
+    ripples = 0.1 * spacing(NODES) * torch.randn((NODES,) * 3, generator=torch.Generator().manual_seed(0))
+    rippled = too_large(0.0) + ripples
+    told = shared_brightness(scene(known_up_to=-0.3), rippled)
+    _, gradient = value_and_gradient(rippled, locate(told.positions, NODES))
+    outwards = F.normalize(told.positions, dim=-1)
+    off, of_field = (
+        1 - (F.normalize(normals, dim=-1) * outwards).sum(-1).mean() for normals in (told.normals, gradient)
+    )
+    assert off < 0.4 * of_field
+
+
 def test_a_second_look_is_nearer_than_the_first() -> None:
     measured = scene()
     first = shared_brightness(measured, too_large())
