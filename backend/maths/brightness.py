@@ -20,7 +20,7 @@ from torch import Tensor
 
 from .correlation import window_sum
 
-SIGMA_OF_MEDIAN_DEVIATION = 1.4826
+_SIGMA_OF_MEDIAN_DEVIATION = 1.4826
 """A normal law's standard deviation, beside the median of what is off its middle."""
 STRAIGHT = 0.3
 """Largest difference between the slope on one side and on both, beside the latter: texture finer than the way
@@ -102,9 +102,14 @@ def exposure_ratio(
     weights_up_to = weight.gather(-1, order).cumsum(dim=-1)
     middle = (weights_up_to < weights_up_to[:, -1:] / 2).sum(dim=-1)
     ratio = ordered.gather(-1, middle[:, None])[:, 0]
-    spread = SIGMA_OF_MEDIAN_DEVIATION * (ratios[0] - ratio[0]).abs().median()
+    spread = median_deviation(ratios[0] - ratio[0])
     error = math.sqrt(math.pi / 2 / here.shape[1]) * spread
     return torch.where((ratio[0] - 1).abs() > 3 * error, ratio, 1.0)
+
+
+def median_deviation(off: Float[Tensor, "*channels values"]) -> Float[Tensor, "*channels"]:
+    """Of values that are `off` their middle; the worst of them have no part in it."""
+    return _SIGMA_OF_MEDIAN_DEVIATION * off.abs().median(dim=-1).values
 
 
 def means_of_cells(

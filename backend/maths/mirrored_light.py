@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from functools import cache
 
 import torch
+import torch.nn.functional as F
 from jaxtyping import Float, Int64
 from torch import Tensor
 
@@ -33,20 +34,18 @@ _FREEDOM = 3.0
 class MirroredLight:
     """From all sides, up to a constant, and how well it is known."""
 
-    light: Float[Tensor, "bins"]
+    mean: Float[Tensor, "bins"]
     covariance: Float[Tensor, "bins bins"]
 
     def to(self, device: torch.device) -> "MirroredLight":
         """The same in single precision on a device."""
-        return MirroredLight(
-            light=self.light.float().to(device), covariance=self.covariance.float().to(device)
-        )
+        return MirroredLight(mean=self.mean.float().to(device), covariance=self.covariance.float().to(device))
 
     def difference(
         self, here: Int64[Tensor, "*places"], there: Int64[Tensor, "*places"]
     ) -> Float[Tensor, "*places"]:
         """From one direction less from another."""
-        return self.light[here] - self.light[there]
+        return self.mean[here] - self.mean[there]
 
     def variance(
         self, here: Int64[Tensor, "*places"], there: Int64[Tensor, "*places"]
@@ -72,14 +71,14 @@ def mirrored_bins(
 
 
 def means_of_bins(
-    here: Int64[Tensor, "places"], there: Int64[Tensor, "places"], cell: Int64[Tensor, "places"]
+    here: Int64[Tensor, "places"], there: Int64[Tensor, "places"], cell: Int64[Tensor, "places"], fewest: int
 ) -> Float[Tensor, "cells bins"]:
-    """Rows that, times the light, are the cells' means of its differences; cells are numbered from 0."""
+    """Rows that, times the light, are cells' means of its differences; as brightness.means_of_cells."""
     count = torch.bincount(cell)
     sums = torch.zeros(len(count) * BINS, device=cell.device)
     one = torch.ones(len(cell), device=cell.device)
     sums.index_add_(0, cell * BINS + here, one).index_add_(0, cell * BINS + there, -one)
-    return sums.view(-1, BINS) / count.clamp(min=1)[:, None]
+    return (sums.view(-1, BINS) / count.clamp(min=1)[:, None])[count >= fewest]
 
 
 def mirrored_light(
@@ -97,10 +96,10 @@ def mirrored_light(
         scale2 = max(((scale * noise) ** 2 for scale in _SCALES), key=lambda s2: _log_evidence(own, seen, s2))
         posterior = scale2 / (1 + scale2 * own)
         known = half @ axes
-        light = known @ (posterior * seen)
-        off2 = (difference - rows @ light).square() / variance
+        mean = known @ (posterior * seen)
+        off2 = (difference - rows @ mean).square() / variance
         weight = 1 / (variance * (1 + off2 / _OUTLYING**2))
-    return MirroredLight(light=light, covariance=(known * posterior) @ known.T)
+    return MirroredLight(mean=mean, covariance=(known * posterior) @ known.T)
 
 
 def gain_nats(
@@ -112,7 +111,7 @@ def gain_nats(
     """How much better it predicts differences than none: mean logarithm of the ratio of their densities."""
     predicted = ((rows @ light.covariance) * rows).sum(dim=-1).clamp(min=0)
     without = _log_density(difference, variance)
-    return float((_log_density(difference - rows @ light.light, variance + predicted) - without).mean())
+    return float((_log_density(difference - rows @ light.mean, variance + predicted) - without).mean())
 
 
 def spread_of_bins(
@@ -144,7 +143,7 @@ def _alike() -> Float[Tensor, "bins bins"]:
     side = (torch.arange(_SIDE, dtype=torch.float64) + 0.5) / _SIDE * 2 - 1
     u, v = (axis.flatten() for axis in torch.meshgrid(side, side, indexing="ij"))
     z = 1 - u.abs() - v.abs()
-    directions = torch.nn.functional.normalize(torch.stack([*_folded(u, v, z < 0), z], dim=-1), dim=-1)
+    directions = F.normalize(torch.stack([*_folded(u, v, z < 0), z], dim=-1), dim=-1)
     alike = torch.exp((directions @ directions.T - 1) / _LOBE_RAD**2)
     return alike + 1e-6 * torch.eye(BINS, dtype=torch.float64)
 

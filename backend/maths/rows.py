@@ -1,7 +1,9 @@
 """Tables of tensors: dataclasses whose fields all have a row for each of the same things."""
 
+from collections.abc import Sequence
 from typing import TypeVar
 
+import torch
 from jaxtyping import Bool
 from torch import Tensor
 
@@ -14,3 +16,10 @@ class Rows:
     def chosen(self: Table, which: Bool[Tensor, "rows"]) -> Table:
         """Some of them."""
         return type(self)(**{name: values[which] for name, values in vars(self).items()})
+
+
+def together(tables: Sequence[Table]) -> Table:
+    """The rows of all tables, of which there is at least one."""
+    return type(tables[0])(
+        **{name: torch.cat([vars(table)[name] for table in tables]) for name in vars(tables[0])}
+    )

@@ -35,12 +35,12 @@ from ..maths.evidence import cube_keys
 from ..maths.geometry import Pinhole, project, sample_image
 from ..maths.grid import spacing
 from ..maths.mirrored_light import means_of_bins, mirrored_bins
-from ..maths.rows import Rows
+from ..maths.rows import Rows, together
 from ..maths.srgb import linear_from_srgb
 from ..scene import Decision
 from .measurements import SURE, Measurements
 from .seen_field import at_size, may_show, seen_field, smaller
-from .shine import Boxes, Shine, deviations, mirrored_by, together
+from .shine import Boxes, Shine, deviations, mirrored_by
 from .stereo_windows import neighbours
 
 MOSTLY_TEXTURED = 0.7
@@ -112,11 +112,11 @@ def shared_brightness(
         if (compared := _compared(picture, pictures[other], len(distance))) is not None
     ]
     if not compared:
-        return _together([])
+        return _nothing()
     boxes = together([pair.boxes for pair in compared])
-    noise = deviations(boxes.difference[:, boxes.sure])
+    noise = deviations(boxes.difference[boxes.sure])
     shine = mirrored_by(boxes, noise, compared[0].cell) if may_shine else None
-    return _off_outlines(scene, _together([_told(pair, noise, shine) for pair in compared]))
+    return _off_outlines(scene, together([_told(pair, noise, shine) for pair in compared]))
 
 
 def textured(scene: Measurements, distance: Float[Tensor, "nodes nodes nodes"]) -> float:
@@ -296,9 +296,9 @@ def _compared(one: _Picture, other: _Picture, nodes: int) -> _Compared | None:
     )
     return _Compared(
         boxes=Boxes(
-            difference=boxes(difference),
-            slope=boxes(along.slope),
-            rows=means_of_bins(bins[0], bins[1], box)[torch.bincount(box) >= _FEWEST_IN_BOX],
+            difference=boxes(difference).T,
+            slope=boxes(along.slope).T,
+            mirrored=means_of_bins(bins[0], bins[1], box, _FEWEST_IN_BOX),
             sure=in_sure,
         ),
         places=places.chosen(~sure),
@@ -341,14 +341,6 @@ def _off_outlines(scene: Measurements, shown: ShownPlaces) -> ShownPlaces:
     return shown.chosen(kept)
 
 
-def _together(parts: Sequence[ShownPlaces]) -> ShownPlaces:
-    nothing = torch.zeros((0, 3))
-    if not parts:
-        none = nothing[:, 0]
-        return ShownPlaces(positions=nothing, normals=nothing, weights=none, mirrored=none)
-    return ShownPlaces(
-        positions=torch.cat([part.positions for part in parts]),
-        normals=torch.cat([part.normals for part in parts]),
-        weights=torch.cat([part.weights for part in parts]),
-        mirrored=torch.cat([part.mirrored for part in parts]),
-    )
+def _nothing() -> ShownPlaces:
+    places, numbers = torch.zeros((0, 3)), torch.zeros(0)
+    return ShownPlaces(positions=places, normals=places, weights=numbers, mirrored=numbers)

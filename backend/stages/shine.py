@@ -4,15 +4,15 @@ Fitted to what photographs show differently where patches are silent, and believ
 show differently where patches agree. A matt thing is left as it is.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
-from ..maths.brightness import SIGMA_OF_MEDIAN_DEVIATION
+from ..maths.brightness import median_deviation
 from ..maths.mirrored_light import MirroredLight, gain_nats, mirrored_light, spread_of_bins
+from ..maths.rows import Rows
 
 _LEAST_GAIN_NATS = 0.06
 """Of a prediction, for each box: an eighth of the variance. Matt things have up to 0.05 in most looks,
@@ -24,13 +24,13 @@ _OFF_CELLS = 1.0
 
 
 @dataclass(frozen=True, kw_only=True)
-class Boxes:
+class Boxes(Rows):
     """What two photographs show differently, by channels, averaged over boxes of places."""
 
-    difference: Float[Tensor, "channels boxes"]
-    slope: Float[Tensor, "channels boxes"]
+    difference: Float[Tensor, "boxes channels"]
+    slope: Float[Tensor, "boxes channels"]
     """Its change per unit along the rays of one of them."""
-    rows: Float[Tensor, "boxes bins"]
+    mirrored: Float[Tensor, "boxes bins"]
     """Mirrored directions, as in maths.mirrored_light.means_of_bins."""
     sure: Bool[Tensor, "boxes"]
     """Whether patches agree there."""
@@ -55,20 +55,9 @@ class Shine:
         return difference - mirrored, (known + left).sqrt()
 
 
-def together(parts: Sequence[Boxes]) -> Boxes:
-    """Of several pairs of photographs."""
-    return Boxes(
-        difference=torch.cat([part.difference for part in parts], dim=1),
-        slope=torch.cat([part.slope for part in parts], dim=1),
-        rows=torch.cat([part.rows for part in parts]),
-        sure=torch.cat([part.sure for part in parts]),
-    )
-
-
-def deviations(difference: Float[Tensor, "channels boxes"]) -> Float[Tensor, "channels"]:
+def deviations(difference: Float[Tensor, "boxes channels"]) -> Float[Tensor, "channels"]:
     """By how much boxes differ, from their median and thus without the few that something else spoils."""
-    middle = difference.abs().median(dim=1).values
-    return (SIGMA_OF_MEDIAN_DEVIATION * middle).clamp(min=_LEAST_DIFFERENCE)
+    return median_deviation(difference.T).clamp(min=_LEAST_DIFFERENCE)
 
 
 def mirrored_by(boxes: Boxes, matt_noise: Float[Tensor, "channels"], cell: float) -> Shine | None:
@@ -78,7 +67,7 @@ def mirrored_by(boxes: Boxes, matt_noise: Float[Tensor, "channels"], cell: float
     """
     device, sure = boxes.sure.device, boxes.sure.cpu()
     rows, difference, slope, noise = (
-        values.cpu().double() for values in (boxes.rows, boxes.difference, boxes.slope, matt_noise)
+        values.cpu().double() for values in (boxes.mirrored, boxes.difference.T, boxes.slope.T, matt_noise)
     )
     off2 = torch.where(sure, 0.0, _OFF_CELLS * cell * slope).square()
     variance = noise[:, None].square() + off2
@@ -91,8 +80,8 @@ def mirrored_by(boxes: Boxes, matt_noise: Float[Tensor, "channels"], cell: float
     if gain_nats(brightness, rows[sure], difference[0, sure], variance[0, sure]) < _LEAST_GAIN_NATS:
         return None
     lights = [fitted(channel, torch.ones_like(sure)) for channel in range(len(noise))]
-    left = difference - torch.stack([rows @ light.light for light in lights])
-    left2 = deviations(left[:, sure]).square()[:, None]
+    left = difference - torch.stack([rows @ light.mean for light in lights])
+    left2 = deviations(left[:, sure].T).square()[:, None]
     spread = torch.stack(
         [spread_of_bins(rows, one.square() / (left2[c] + off2[c])) for c, one in enumerate(left)]
     )

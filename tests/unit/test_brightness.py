@@ -3,7 +3,14 @@
 import pytest
 import torch
 
-from backend.maths.brightness import channels_of, depth_steps, exposure_ratio, means_of_cells, slopes_along
+from backend.maths.brightness import (
+    channels_of,
+    depth_steps,
+    exposure_ratio,
+    means_of_cells,
+    median_deviation,
+    slopes_along,
+)
 
 EVERYWHERE = torch.ones((2, 9, 11), dtype=torch.bool)
 
@@ -112,3 +119,10 @@ def test_means_are_those_of_cells_with_enough_places() -> None:
     assert means_of_cells(values, cell, 2).tolist() == [[2.0, 6.0], [2.0, 1.0]]
     assert means_of_cells(values, cell, 4).tolist() == [[], []]
     assert means_of_cells(values[:, :0], cell[:0], 1).tolist() == [[], []]
+
+
+def test_a_median_deviation_is_that_of_a_normal_law_whatever_the_worst_are() -> None:
+    off = torch.randn(2, 20_001, generator=torch.Generator().manual_seed(0)) * torch.tensor([[0.1], [3.0]])
+    torch.testing.assert_close(median_deviation(off), torch.tensor([0.1, 3.0]), rtol=0.03, atol=0)
+    worse = torch.where(off.abs() > off.abs().median(dim=-1, keepdim=True).values, 1e6 * off, off)
+    torch.testing.assert_close(median_deviation(worse), median_deviation(off), rtol=0, atol=0)

@@ -44,7 +44,7 @@ def differences(
     one = directions(count, generator)
     other = F.normalize(one + 0.4 * directions(count, generator), dim=-1)
     bins = torch.stack([mirrored_bins(one, one), mirrored_bins(other, other)])
-    rows = means_of_bins(bins[0], bins[1], torch.arange(count)).double()
+    rows = means_of_bins(bins[0], bins[1], torch.arange(count), 1).double()
     noise = NOISE * torch.randn(count, generator=generator, dtype=torch.float64)
     return rows, rows @ lobe(middles()) + noise, bins
 
@@ -71,11 +71,13 @@ def test_rows_are_means_over_cells() -> None:
     light = torch.randn(BINS, generator=generator)
     here, there = torch.randint(BINS, (2, 60), generator=generator)
     cell = torch.arange(60) % 7
-    rows = means_of_bins(here, there, cell)
+    rows = means_of_bins(here, there, cell, 1)
     for number in range(7):
         which = cell == number
         expected = (light[here[which]] - light[there[which]]).mean()
         assert float(rows[number] @ light) == pytest.approx(float(expected), abs=1e-5)
+    assert len(means_of_bins(here, there, cell, 9)) == 4  # 60 = 4 * 9 + 3 * 8
+    assert not len(means_of_bins(here, there, cell, 10))
 
 
 @pytest.mark.parametrize("spoiled", [0, 100])
@@ -84,7 +86,7 @@ def test_light_is_told_from_differences_of_which_some_may_be_anything(spoiled: i
     difference[:spoiled] += 0.5
     light = mirrored_light(rows, difference, torch.full((2000,), NOISE**2), NOISE)
     truth = lobe(middles())
-    off = (light.light - truth) - (light.light - truth).mean()
+    off = (light.mean - truth) - (light.mean - truth).mean()
     assert float(off.square().mean().sqrt()) < 0.1 * float(truth.std())
 
 

@@ -172,9 +172,9 @@ def test_nobody_shines_of_whom_patches_tell_everything() -> None:
     """Nothing is left that mirrored light could be fitted to."""
     generator = torch.Generator().manual_seed(0)
     rows = torch.randn(60, BINS, generator=generator)
-    difference = torch.randn(3, 60, generator=generator)
+    difference = torch.randn(60, 3, generator=generator)
     sure = torch.ones(60, dtype=torch.bool)
-    boxes = Boxes(difference=difference, slope=torch.zeros_like(difference), rows=rows, sure=sure)
+    boxes = Boxes(difference=difference, slope=torch.zeros_like(difference), mirrored=rows, sure=sure)
     assert mirrored_by(boxes, deviations(difference), 0.03) is None
 
 
