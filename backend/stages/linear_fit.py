@@ -1,5 +1,6 @@
 """The linear part of the fit: the smoothest field that agrees with points, silhouettes and free space."""
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
@@ -84,6 +85,12 @@ def for_plain(config: LinearConfig, textured: float, told: float) -> LinearConfi
     )
 
 
+def weight_beside(told: ShownPlaces, scene: Measurements, config: LinearConfig) -> float:
+    """Of what brightness `told`, beside what stereo measured; infinite where that is nothing."""
+    told_weight, measured = config.brightness * told.weights.sum(), _stereo_weights(scene, config).sum()
+    return float(told_weight / measured) if measured > 0 else math.inf
+
+
 def start(scene: Measurements, radius: float, nodes: int) -> Float[Tensor, "nodes nodes nodes"]:
     """A field to begin with: the ball behind the surface, cut by what is free."""
     return torch.maximum(ball_behind(scene, radius, nodes), least_distance(scene, nodes))
@@ -162,12 +169,16 @@ def _points(
 ) -> OrientedPoints:
     """What stereo measured and what brightness tells, merged in cubes."""
     positions, normals = scene.positions, scene.normals
-    sure = config.stereo * scene.confidence**config.confidence_power
+    sure = _stereo_weights(scene, config)
     if shown is not None:
         positions = torch.cat([positions, shown.positions])
         normals = torch.cat([normals, shown.normals])
         sure = torch.cat([sure, config.brightness * shown.weights])
     return merged_points(positions, normals, sure, cell, correlated=config.correlated)
+
+
+def _stereo_weights(scene: Measurements, config: LinearConfig) -> Float[Tensor, "points"]:
+    return config.stereo * scene.confidence**config.confidence_power
 
 
 def _near_nodes(points: OrientedPoints, nodes: int, config: LinearConfig) -> PointDistances:

@@ -6,10 +6,11 @@ from dataclasses import dataclass
 import torch
 import torch.nn.functional as F
 from jaxtyping import Bool, Float
+from scipy.ndimage import binary_erosion
 from torch import Tensor
 
 from ..maths.geometry import Pinhole, pixel_centres, project, ray_directions
-from ..maths.grid import locate, node_positions, spacing, value_and_gradient
+from ..maths.grid import locate, node_steps, spacing, value_and_gradient
 from .silhouettes import grid_crossing, grid_entry
 
 
@@ -27,6 +28,15 @@ class SeenField:
     """Away from the camera, of unit length."""
     cosine: Float[Tensor, "pixels"]
     """Between the normal and the way back to the camera."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class NearSurface:
+    """Nodes of a field's grid that its surface passes by: what of it a photograph can show."""
+
+    positions: Float[Tensor, "points 3"]
+    cell: float
+    """Side of a cell of the grid."""
 
 
 def seen_field(
@@ -50,21 +60,30 @@ def seen_field(
     )
 
 
-def may_show(camera: Pinhole, distance: Float[Tensor, "nodes nodes nodes"]) -> Bool[Tensor, "height width"]:
-    """Pixels whose rays may meet the field in its cube: those around what shows a node inside, or next to it.
+def near_surface(distance: Float[Tensor, "nodes nodes nodes"]) -> NearSurface:
+    """Nodes of the grid within two cells of the field's surface, and all inside that lie next to outside."""
+    h = spacing(len(distance))
+    # what is outside the cube counts as outside: rays come from there
+    deep = torch.tensor(binary_erosion((distance < 0).cpu().numpy()), device=distance.device)
+    steps = node_steps(len(distance), distance.device)
+    return NearSurface(positions=steps[torch.nonzero((distance < 2 * h) & ~deep)], cell=h)
+
+
+def may_show(camera: Pinhole, near: NearSurface) -> Bool[Tensor, "height width"]:
+    """Pixels whose rays may meet the field in its cube: those around what shows a node near its surface.
 
     Where there is no subject to ask about, most rays pass by the field, and are the longest to trace.
     """
-    h, size = spacing(len(distance)), (camera.height, camera.width)
-    pixels, depth = project(camera, node_positions(len(distance), distance.device)[distance < 2 * h])
-    if not len(depth) or depth.min() < 2 * h:
-        return torch.full(size, bool(len(depth)), device=distance.device)
+    size = (camera.height, camera.width)
+    pixels, depth = project(camera, near.positions)
+    if not len(depth) or depth.min() < 2 * near.cell:
+        return torch.full(size, bool(len(depth)), device=depth.device)
     # squares of a cell as it shows at most, and those around them
-    side = math.ceil(h * float(camera.intrinsics[:2, :2].amax() / depth.min()))
+    side = math.ceil(near.cell * float(camera.intrinsics[:2, :2].amax() / depth.min()))
     rows, columns = math.ceil(camera.height / side) + 2, math.ceil(camera.width / side) + 2
     square = (pixels / side).floor().long() + 1
     x, y = square[:, 0].clamp(0, columns - 1), square[:, 1].clamp(0, rows - 1)
-    shown = torch.zeros((1, 1, rows, columns), device=distance.device)
+    shown = torch.zeros((1, 1, rows, columns), device=depth.device)
     shown[0, 0, y, x] = 1.0
     around = F.max_pool2d(shown, 3, stride=1, padding=1)[0, 0, 1:-1, 1:-1] > 0
     whole = around.repeat_interleave(side, dim=0).repeat_interleave(side, dim=1)

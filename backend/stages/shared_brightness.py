@@ -39,7 +39,7 @@ from ..maths.rows import Rows, together
 from ..maths.srgb import linear_from_srgb
 from ..scene import Decision
 from .measurements import SURE, Measurements
-from .seen_field import at_size, may_show, seen_field, smaller
+from .seen_field import NearSurface, at_size, may_show, near_surface, seen_field, smaller
 from .shine import Boxes, Shine, deviations, mirrored_by
 from .stereo_windows import neighbours
 
@@ -103,7 +103,8 @@ def shared_brightness(
 
     If it `may_shine`, light that it is found to mirror is taken off first.
     """
-    pictures = [_picture(scene, index, distance) for index in range(len(scene.cameras))]
+    near = near_surface(distance)
+    pictures = [_picture(scene, index, distance, near) for index in range(len(scene.cameras))]
     partners = neighbours(scene.cameras, _PARTNERS)
     compared = [
         compared
@@ -124,9 +125,9 @@ def textured(scene: Measurements, distance: Float[Tensor, "nodes nodes nodes"]) 
 
     Surroundings that the field does not have count for nothing, whether the subject is known or not.
     """
-    told = []
+    told, near = [], near_surface(distance)
     for index, confidence in enumerate(scene.confidences):
-        camera, asked = _asked(scene, index, distance, _GLANCE)
+        camera, asked = _asked(scene, index, near, _GLANCE)
         seen = seen_field(camera, asked, distance)
         facing = seen.hit & (seen.cosine > _LEAST_COSINE)
         told.append((at_size(confidence, camera)[asked][facing] / SURE).clamp(max=1.0))
@@ -202,10 +203,12 @@ class _Compared:
     """Side of a cell of the grid."""
 
 
-def _picture(scene: Measurements, index: int, distance: Float[Tensor, "nodes nodes nodes"]) -> _Picture:
-    camera, asked = _asked(scene, index, distance, _SHARE)
+def _picture(
+    scene: Measurements, index: int, distance: Float[Tensor, "nodes nodes nodes"], near: NearSurface
+) -> _Picture:
+    camera, asked = _asked(scene, index, near, _SHARE)
     if (num_asked := int(asked.sum())) > _MOST_PIXELS:
-        camera, asked = _asked(scene, index, distance, _SHARE * math.sqrt(_MOST_PIXELS / num_asked))
+        camera, asked = _asked(scene, index, near, _SHARE * math.sqrt(_MOST_PIXELS / num_asked))
     seen = seen_field(camera, asked, distance)
     depth, facing = torch.zeros(asked.shape, device=asked.device), torch.zeros_like(asked)
     depth[asked] = torch.where(seen.hit, seen.depth, 0.0)
@@ -227,11 +230,11 @@ def _picture(scene: Measurements, index: int, distance: Float[Tensor, "nodes nod
 
 
 def _asked(
-    scene: Measurements, index: int, distance: Float[Tensor, "nodes nodes nodes"], share: float
+    scene: Measurements, index: int, near: NearSurface, share: float
 ) -> tuple[Pinhole, Bool[Tensor, "height width"]]:
     """A camera of so much of a photograph's size, and its pixels on the subject that may show the field."""
     camera, subject = smaller(scene.cameras[index], share), scene.certain[index]
-    return camera, may_show(camera, distance) if subject is None else at_size(subject, camera) < 0
+    return camera, may_show(camera, near) if subject is None else at_size(subject, camera) < 0
 
 
 def _evened(

@@ -17,7 +17,7 @@ from ..maths.grid import refined, spacing
 from ..scene import Decision, Progress, Region, StereoResult, View, within
 from .deadline import Clock, Deadline, GridCost, deadline_after, finest_grid, predicted_s
 from .inner_outlines import FarSide, decision, far_sides
-from .linear_fit import Ask, LinearConfig, fit_level, for_plain, start
+from .linear_fit import Ask, LinearConfig, fit_level, for_plain, start, weight_beside
 from .measurements import Measurements, carried, measurements
 from .render_fit import RenderConfig, refine
 from .safe_steps import not_finite
@@ -25,6 +25,9 @@ from .shared_brightness import MOSTLY_TEXTURED, ShownPlaces, share_told, shared_
 from .shared_brightness import decision as of_brightness
 from .surface import COARSEST, ShowSurface, Surface, show_nothing, tight_frame
 from .unseen_depth import depth_behind
+
+_LITTLE = 0.1
+"""What brightness tells, beside what stereo measured: with less, asking again does not move the field."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -158,10 +161,15 @@ def _asking(
     began_s: float,
     progress: Progress,
 ) -> Ask:
-    """Asks brightness, `looks` times while there is time, and keeps what it answers in `shown`."""
+    """Asks brightness, `looks` times while there is time, and keeps what it answers in `shown`.
+
+    Once if that weighs little: beside texture it does not, and each look takes as long as a round of the fit.
+    """
     before = len(shown)
 
     def ask(distance: Float[Tensor, "nodes nodes nodes"]) -> ShownPlaces | None:
+        if len(shown) > before and weight_beside(shown[-1], scene, config) < _LITTLE:
+            return None
         # a look and a round take less than the fit did until here
         if deadline.left_s() < deadline.clock() - began_s:
             return None

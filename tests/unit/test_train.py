@@ -5,6 +5,7 @@ gets on photographs of full size.
 """
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import cache, partial
 from itertools import count
 from typing import Any
@@ -28,7 +29,7 @@ from backend.scene import (
     within,
 )
 from backend.stages import train
-from backend.stages.linear_fit import fit_level
+from backend.stages.linear_fit import LinearConfig, fit_level
 from backend.stages.measurements import Measurements
 from backend.stages.mesh import MeshConfig, extract_mesh, level_set, preview_mesh
 from backend.stages.shared_brightness import ShownPlaces
@@ -386,3 +387,29 @@ def test_the_last_grid_of_a_plain_subject_is_fitted_as_such(monkeypatch: pytest.
         heard.clear()
         fitted(*what, config)
         assert heard[-4:] == [(16, 1.0, 0), (20, 1.0, 0), (24, 1.0, num), (32, stereo, num)]
+
+
+def test_what_hardly_weighs_is_asked_about_once_on_each_grid(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Stereo's points weigh the cube of their confidence."""
+    some, asked = torch.tensor([[0.0, 0.0, 0.5], [0.0, 0.5, 0.0]]), [0]
+    views, region, stereo = masked_scene(), true_region(), masked_stereo()
+    measured = float((torch.tensor(stereo.points.confidence) ** 3).sum())
+    monkeypatch.setattr(train, "textured", lambda scene, distance: 0.35)
+    config = TrainConfig(levels=(16, 24, 32), rounds=(3, 5, 5), steps=(0, 0, 0), looks=(0, 3, 2))
+    config = replace(config, linear=LinearConfig(settled=0.0))
+    for share, looks in ((0.05, 1 + 1), (0.2, 3 + 2)):
+        told = ShownPlaces(
+            positions=some,
+            normals=2 * some,
+            weights=torch.full((2,), share * measured / 2),
+            mirrored=torch.zeros(2),
+        )
+
+        def counted(*field: Any, told: ShownPlaces = told, **how: Any) -> ShownPlaces:
+            asked[0] += 1
+            return told
+
+        asked[0] = 0
+        monkeypatch.setattr(train, "shared_brightness", counted)
+        fitted(views, region, stereo, config)
+        assert asked[0] == looks
