@@ -186,6 +186,28 @@ def test_pictures_of_much_are_looked_at_smaller(monkeypatch: pytest.MonkeyPatch)
     assert error(fewer.positions[fewer.positions[:, 1] > 0.15]) < 0.15 * TOO_LARGE
 
 
+def test_sure_places_are_judged_apart_from_silent_ones_among_them() -> None:
+    """Stripes as wide as half a box, by turns sure and right, and silent and off."""
+
+    def wave(y: Float[Tensor, "*places"]) -> Float[Tensor, "*places"]:
+        return torch.sin(2 * math.pi * y / (6 * spacing(NODES)))
+
+    nodes, pixels = node_positions(NODES, torch.device("cpu")), pixel_centres(SIZE, SIZE, torch.device("cpu"))
+    field = nodes.norm(dim=-1) - RADIUS - TOO_LARGE * (2 * wave(nodes[..., 1])).clamp(0, 1)
+    known = scene(known_up_to=1.0)
+    confidences = [
+        confidence * (wave(unproject(one, pixels, depth)[..., 1]) < -0.2)
+        for one, depth, confidence in zip(known.cameras, known.depths, known.confidences, strict=True)
+    ]
+    off, right = (
+        shared_brightness(replace(known, confidences=confidences), one).weights
+        for one in (field, too_large(0.0))
+    )
+    assert min(len(off), len(right)) > 1000
+    # what is off leaves something unexplained, 0.58 of the weight; judged together it would be 0.42
+    assert float(off.mean()) > 0.5 * float(right.mean())
+
+
 def test_small_windows_that_go_wild_are_not_believed(monkeypatch: pytest.MonkeyPatch) -> None:
     """In noisy photographs: what a wide window does not confirm is far off more often than the rest."""
     torch.manual_seed(0)
