@@ -23,7 +23,7 @@ from .unseen_side import ball_behind, depth_is_bounded
 OrientedPoints = tuple[Float[Tensor, "points 3"], Float[Tensor, "points 3"], Float[Tensor, "points"]]
 """Positions, normals and weights."""
 Ask = Callable[[Float[Tensor, "nodes nodes nodes"]], ShownPlaces | None]
-"""What brightness tells about a field; None if nothing, and not to be asked again."""
+"""What brightness tells about a field; None if nothing more, and not to be asked again."""
 _ENOUGH_TOLD = 0.07
 """Share of the surface that brightness has to tell for it to be fitted as what is plain."""
 _FADE = 0.7

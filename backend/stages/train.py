@@ -27,7 +27,7 @@ from .surface import COARSEST, ShowSurface, Surface, show_nothing, tight_frame
 from .unseen_depth import depth_behind
 
 _LITTLE = 0.1
-"""What brightness tells, beside what stereo measured: with less, asking again does not move the field."""
+"""Weight of what brightness tells, beside stereo's points: with less, asking again moves nothing."""
 
 
 @dataclass(frozen=True, kw_only=True)
