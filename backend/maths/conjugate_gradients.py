@@ -6,6 +6,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from .repeated import State, repeated
+
 
 def conjugate_gradients(
     apply: Callable[[Tensor], Tensor],
@@ -19,19 +21,20 @@ def conjugate_gradients(
 
     `apply` is linear, symmetric and positive definite (Hestenes and Stiefel, 1952).
     """
-    solution = start.clone()
-    residual = right - apply(solution)
-    direction = residual / diagonal
-    energy = _product(residual, direction)
-    for _ in range(steps):
+
+    def step(state: State) -> State:
+        solution, residual, direction, energy = state
         image = apply(direction)
-        step = energy / _product(direction, image).clamp(min=1e-30)
-        solution.addcmul_(step, direction)
-        residual.addcmul_(step, image, value=-1)
+        length = energy / _product(direction, image).clamp(min=1e-30)
+        residual = torch.addcmul(residual, length, image, value=-1)
         conditioned = residual / diagonal
-        before, energy = energy, _product(residual, conditioned)
-        direction = conditioned.addcmul_(energy / before.clamp(min=1e-30), direction)
-    return solution
+        left = _product(residual, conditioned)
+        turned = conditioned.addcmul_(left / energy.clamp(min=1e-30), direction)
+        return torch.addcmul(solution, length, direction), residual, turned, left
+
+    residual = right - apply(start)
+    direction = residual / diagonal
+    return repeated(step, (start, residual, direction, _product(residual, direction)), steps)[0]
 
 
 def _product(

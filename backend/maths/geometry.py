@@ -5,6 +5,7 @@ Names: `intrinsics` is K (3x3), pixel = K X / depth; `b_from_a` are 4x4 rigid tr
 """
 
 from dataclasses import dataclass
+from functools import cached_property, lru_cache
 
 import torch
 import torch.nn.functional as F
@@ -14,16 +15,16 @@ from torch import Tensor
 from ..scene import Camera, Region
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Pinhole:
-    """A camera of the object frame as tensors; lengths in object units."""
+    """A camera of the object frame as tensors; lengths in object units. One is equal to itself alone."""
 
     intrinsics: Float[Tensor, "3 3"]
     camera_from_object: Float[Tensor, "4 4"]
     width: int
     height: int
 
-    @property
+    @cached_property
     def position(self) -> Float[Tensor, "3"]:
         """Centre of projection, object frame."""
         return -self.camera_from_object[:3, :3].T @ self.camera_from_object[:3, 3]
@@ -95,6 +96,7 @@ def unproject(
     return camera.position + depth[..., None] * ray_directions(camera, pixels)
 
 
+@lru_cache(maxsize=1024)  # the same few pairs are compared at every step; inverting takes a GPU long
 def epipolar_map(source: Pinhole, reference: Pinhole) -> tuple[Float[Tensor, "3 3"], Float[Tensor, "3"]]:
     """(A, b) such that reference pixel u at inverse depth w is seen at A [u 1] + w b, homogeneous."""
     source_from_reference = source.camera_from_object @ torch.linalg.inv(reference.camera_from_object)

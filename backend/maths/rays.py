@@ -1,22 +1,20 @@
 """Searching rays for the surface of a distance field."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int64
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ..kernels import ray_crossing
 from ..kernels.compiled import floats
 from ..kernels.side_by_side import side_by_side
 from .grid import read
-from .rows import Rows
+from .repeated import State, repeated
 
-_TOGETHER = 8
-"""Steps of all rays before those that are done are left out."""
 _RAYS_IN_ONE_GO = 4096
 """Of a thread, where compiled."""
 DistanceFunction = Callable[[Float[Tensor, "points 3"]], Float[Tensor, "points"]]
@@ -86,26 +84,10 @@ def first_crossing(
         if grid.device.type == "cpu" and grid.dtype == torch.float32:
             return _compiled_crossing(grid, origins, directions, start, (reach, shortest, longest, steps))
         distance = partial(read, grid)
-    place, hit = start.clone(), torch.zeros_like(start, dtype=torch.bool)
-    nowhere = start + torch.inf
-    rays = _Rays(
-        number=torch.arange(len(start), device=start.device),
-        origins=origins,
-        directions=directions,
-        end=start + reach,
-        along=start,
-        last=start,
-        before=nowhere,
-        nearest=nowhere,
-        at=place,
-        met=hit,
-    )
-    for first in range(0, steps, _TOGETHER):
-        for _ in range(first, min(first + _TOGETHER, steps)):
-            rays = _traced(rays, distance, shortest, longest)
-        place[rays.number], hit[rays.number] = rays.at, rays.met
-        rays = rays.chosen(~rays.met & (rays.last < rays.end))
-    return Crossing(along=place, hit=hit)
+    nowhere, unmet = torch.full_like(start, torch.inf), torch.zeros_like(start, dtype=torch.bool)
+    step = partial(_traced, distance, origins, directions, start + reach, (shortest, longest))
+    at, met = repeated(step, (start, unmet, start, start, nowhere, nowhere), steps)[:2]
+    return Crossing(along=at, hit=met)
 
 
 def _compiled_crossing(
@@ -126,42 +108,30 @@ def _compiled_crossing(
     return Crossing(along=torch.from_numpy(along), hit=torch.from_numpy(hit))
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Rays(Rows):
-    """Rays on their way; lengths are distances from their origins."""
+def _traced(
+    distance: DistanceFunction,
+    origins: Float[Tensor, "rays 3"],
+    directions: Float[Tensor, "rays 3"],
+    end: Float[Tensor, "rays"],
+    lengths: tuple[float, float],
+    state: State,
+) -> State:
+    """Rays after one step. Of each, in lengths along it and values of the field:
 
-    number: Int64[Tensor, "rays"]
-    """Among all that were asked for."""
-    origins: Float[Tensor, "rays 3"]
-    directions: Float[Tensor, "rays 3"]
-    end: Float[Tensor, "rays"]
-    along: Float[Tensor, "rays"]
-    """Where they look next."""
-    last: Float[Tensor, "rays"]
-    """Where they looked before."""
-    before: Float[Tensor, "rays"]
-    """The field there."""
-    nearest: Float[Tensor, "rays"]
-    """The least of it so far."""
-    at: Float[Tensor, "rays"]
-    """Where they met the surface, or were nearest to it."""
-    met: Bool[Tensor, "rays"]
-
-
-def _traced(rays: _Rays, distance: DistanceFunction, shortest: float, longest: float) -> _Rays:
-    """The same rays after one step."""
-    along, last, before = rays.along, rays.last, rays.before
-    here = distance(rays.origins + along[:, None] * rays.directions)
-    closer = (here < rays.nearest) & ~rays.met
-    new = (here <= 0) & ~rays.met
+    where it met the surface, or was nearest to it; whether it met it; where it looks next; where it looked
+    before, and the field there; the least of that so far.
+    """
+    at, met, along, last, before, nearest = state
+    here = distance(origins + along[:, None] * directions)
+    closer = (here < nearest) & ~met
+    new = (here <= 0) & ~met
     share = torch.where(before.isfinite(), before / (before - here).clamp(min=float(ray_crossing.TINY)), 1.0)
-    at = torch.where(closer, along, rays.at)
-    return replace(
-        rays,
-        along=(along + (float(ray_crossing.CAUTION) * here).clamp(shortest, longest)).minimum(rays.end),
-        last=along,
-        before=here,
-        nearest=torch.where(closer, here, rays.nearest),
-        at=torch.where(new, last + share * (along - last), at),
-        met=rays.met | new,
+    at = torch.where(closer, along, at)
+    return (
+        torch.where(new, last + share * (along - last), at),
+        met | new,
+        (along + (float(ray_crossing.CAUTION) * here).clamp(*lengths)).minimum(end),
+        along,
+        here,
+        torch.where(closer, here, nearest),
     )

@@ -18,12 +18,19 @@ def aggregate(
     `small_step` is what it costs to go to the next plane, `large_step` to any other, in the cost's unit; the
     latter may vary over the image (cheaper across its edges).
     """
-    total = _scan_rows(cost, small_step, large_step)
-    total += _scan_rows(cost.flip(0), small_step, large_step.flip(0)).flip(0)
-    across, step_across = cost.transpose(0, 1).contiguous(), large_step.T.contiguous()
-    total += _scan_rows(across, small_step, step_across).transpose(0, 1)
-    total += _scan_rows(across.flip(0), small_step, step_across.flip(0)).flip(0).transpose(0, 1)
-    return total
+    down, up = _scan_both_ways(cost, small_step, large_step)
+    right, left = _scan_both_ways(cost.transpose(0, 1), small_step, large_step.T)
+    return down.add_(up).add_(right.transpose(0, 1)).add_(left.transpose(0, 1))
+
+
+def _scan_both_ways(
+    cost: Float[Tensor, "steps lines planes"], small_step: float, large_step: Float[Tensor, "steps lines"]
+) -> tuple[Float[Tensor, "steps lines planes"], Float[Tensor, "steps lines planes"]]:
+    """`_scan_rows` of the lines from their first step and from their last, side by side."""
+    both = torch.cat([cost, cost.flip(0)], dim=1)
+    path = _scan_rows(both, small_step, torch.cat([large_step, large_step.flip(0)], dim=1))
+    one, other = path.chunk(2, dim=1)
+    return one, other.flip(0)
 
 
 def _scan_rows(

@@ -18,7 +18,7 @@ from backend.stages.stereo import match_views
 from backend.stages.stereo_config import StereoConfig
 from backend.stages.surface import Surface
 from backend.stages.train import TrainConfig, fit_surface
-from tests.synthetic_scene import Scene, photographed, ring_cameras, true_region
+from tests.synthetic_scene import Scene, arc_cameras, photographed, true_region
 
 pytestmark = [
     pytest.mark.gpu,
@@ -44,7 +44,7 @@ FITS = [
 
 @cache
 def scene() -> Scene:
-    return photographed(ring_cameras(6, 64))
+    return photographed(arc_cameras(5, 100, 128))
 
 
 def stereo_on(device: str) -> StereoResult:
