@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 import torch.nn.functional as F
@@ -30,13 +31,24 @@ class SeenField:
     """Between the normal and the way back to the camera."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class NearSurface:
-    """Nodes of a field's grid that its surface passes by: what of it a photograph can show."""
+    """What of a field photographs can show; found when first asked for: where masks tell, nobody does."""
 
-    positions: Float[Tensor, "points 3"]
-    cell: float
-    """Side of a cell of the grid."""
+    distance: Float[Tensor, "nodes nodes nodes"]
+
+    @property
+    def cell(self) -> float:
+        """Side of a cell of the grid."""
+        return spacing(len(self.distance))
+
+    @cached_property
+    def positions(self) -> Float[Tensor, "points 3"]:
+        """Of nodes within two cells of the field's surface, and of all inside that lie next to outside."""
+        # what is outside the cube counts as outside: rays come from there
+        deep = torch.tensor(binary_erosion((self.distance < 0).cpu().numpy()), device=self.distance.device)
+        steps = node_steps(len(self.distance), self.distance.device)
+        return steps[torch.nonzero((self.distance < 2 * self.cell) & ~deep)]
 
 
 def seen_field(
@@ -58,15 +70,6 @@ def seen_field(
         directions=directions,
         cosine=-(normals * directions).sum(dim=-1),
     )
-
-
-def near_surface(distance: Float[Tensor, "nodes nodes nodes"]) -> NearSurface:
-    """Nodes of the grid within two cells of the field's surface, and all inside that lie next to outside."""
-    h = spacing(len(distance))
-    # what is outside the cube counts as outside: rays come from there
-    deep = torch.tensor(binary_erosion((distance < 0).cpu().numpy()), device=distance.device)
-    steps = node_steps(len(distance), distance.device)
-    return NearSurface(positions=steps[torch.nonzero((distance < 2 * h) & ~deep)], cell=h)
 
 
 def may_show(camera: Pinhole, near: NearSurface) -> Bool[Tensor, "height width"]:

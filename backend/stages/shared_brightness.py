@@ -39,7 +39,7 @@ from ..maths.rows import Rows, together
 from ..maths.srgb import linear_from_srgb
 from ..scene import Decision
 from .measurements import SURE, Measurements
-from .seen_field import NearSurface, at_size, may_show, near_surface, seen_field, smaller
+from .seen_field import NearSurface, at_size, may_show, seen_field, smaller
 from .shine import Boxes, Shine, deviations, mirrored_by
 from .stereo_windows import neighbours
 
@@ -103,7 +103,7 @@ def shared_brightness(
 
     If it `may_shine`, light that it is found to mirror is taken off first.
     """
-    near = near_surface(distance)
+    near = NearSurface(distance=distance)
     pictures = [_picture(scene, index, distance, near) for index in range(len(scene.cameras))]
     partners = neighbours(scene.cameras, _PARTNERS)
     compared = [
@@ -125,7 +125,7 @@ def textured(scene: Measurements, distance: Float[Tensor, "nodes nodes nodes"]) 
 
     Surroundings that the field does not have count for nothing, whether the subject is known or not.
     """
-    told, near = [], near_surface(distance)
+    told, near = [], NearSurface(distance=distance)
     for index, confidence in enumerate(scene.confidences):
         camera, asked = _asked(scene, index, near, _GLANCE)
         seen = seen_field(camera, asked, distance)

@@ -5,7 +5,7 @@ import torch
 
 from backend.maths.geometry import Pinhole
 from backend.maths.grid import node_positions
-from backend.stages.seen_field import may_show, near_surface, seen_field
+from backend.stages.seen_field import NearSurface, may_show, seen_field
 
 CPU = torch.device("cpu")
 
@@ -30,7 +30,7 @@ def test_every_pixel_that_meets_the_field_may_show_it(
     seen = seen_field(camera, everywhere, field)
     hit = (seen.hit & (seen.positions.abs().amax(dim=-1) <= 1)).view(120, 160)
     assert hit.any()
-    assert not (hit & ~may_show(camera, near_surface(field))).any()
+    assert not (hit & ~may_show(camera, NearSurface(distance=field))).any()
 
 
 def test_no_pixel_is_left_out_between_nodes_that_lie_behind_one_another() -> None:
@@ -42,7 +42,7 @@ def test_no_pixel_is_left_out_between_nodes_that_lie_behind_one_another() -> Non
     seen = seen_field(camera, torch.ones((120, 160), dtype=torch.bool), field)
     hit = (seen.hit & (seen.positions.abs().amax(dim=-1) <= 1)).view(120, 160)
     assert hit.any()
-    assert not (hit & ~may_show(camera, near_surface(field))).any()
+    assert not (hit & ~may_show(camera, NearSurface(distance=field))).any()
 
 
 def test_rays_that_pass_by_are_told() -> None:
@@ -50,11 +50,11 @@ def test_rays_that_pass_by_are_told() -> None:
     camera = looking_along_z(3.0)
     hit = seen_field(camera, torch.ones((120, 160), dtype=torch.bool), field).hit
     # 20 pixels of radius, and at most 2 cells and 2 squares more, of 2 and 3 pixels
-    assert int(may_show(camera, near_surface(field)).sum()) < 2.4 * int(hit.sum()) < 0.2 * 120 * 160
+    assert int(may_show(camera, NearSurface(distance=field)).sum()) < 2.4 * int(hit.sum()) < 0.2 * 120 * 160
 
 
 def test_from_within_everything_may_show_and_of_an_empty_field_nothing() -> None:
     field = node_positions(24, CPU).norm(dim=-1) - 0.5
-    assert may_show(looking_along_z(0.2), near_surface(field)).all()
-    nothing = near_surface(torch.ones((24, 24, 24)))
+    assert may_show(looking_along_z(0.2), NearSurface(distance=field)).all()
+    nothing = NearSurface(distance=torch.ones((24, 24, 24)))
     assert not may_show(looking_along_z(3.0), nothing).any()
