@@ -12,6 +12,7 @@ from torch import Tensor
 from ..maths.evidence import PointDistances, merged_points, point_distances, seen_through
 from ..maths.grid import locate, spacing, splat
 from ..maths.nearest import nearest_tree
+from ..maths.rays import points_along
 from ..maths.smooth_fit import fit_smooth
 from .inner_outlines import FarSide
 from .measurements import Measurements
@@ -28,6 +29,10 @@ _ENOUGH_TOLD = 0.07
 """Share of the surface that brightness has to tell for it to be fitted as what is plain."""
 _FADE = 0.7
 """Share of its pull that a missed ray keeps in the next round: rays that are hit by then let go."""
+_PUSHED_CELLS = 4.0
+"""How far off a bridge is pushed: as far as brightness may tell that it is too near."""
+_HARDLY_MEASURED = 0.1
+"""Weight of the points around a node that pushes nothing away."""
 _RIM_REACH = 0.2
 """How far from a measured point a rim is sure, in units of the grid's frame, if depth is not bounded."""
 
@@ -118,7 +123,7 @@ def fit_level(
     takes a few rounds; `rounds` at most, fewer where the surface comes to rest. What is before `far` sides is
     free as what is before measured depth. Places `told` about the level before are points as well.
     Before each of the last `looks` rounds, and if the surface rests earlier, `ask` is told the field: the
-    places that it answers with stand in place of those.
+    places that it answers with stand in place of those, and a bridge before those that it hid is pushed away.
     """
     nodes = before.shape[0]
     h = spacing(nodes)
@@ -130,6 +135,7 @@ def fit_level(
     through = _seen_through_any(scene, nodes, 3 * h)
     for side in far:
         through |= seen_through(side.camera, side.depth, 2 * h, nodes)
+    bridges = torch.zeros_like(through)
     through_subject, pulled = silhouette_rays(scene, nodes), torch.zeros((nodes**3, 2), device=before.device)
     met_along = torch.full_like(through_subject.entry, torch.inf)
     rays, nearest = rim_rays(scene, nodes), nearest_tree(points[0].cpu().numpy())
@@ -140,11 +146,14 @@ def fit_level(
                 looks = 0
             else:
                 measured = _near_nodes(_points(scene, config, h / 2, shown), nodes, config)
+                bridges = _before_hidden(shown, nodes) & (measured.weight < _HARDLY_MEASURED)
         target, weight = before.clone(), torch.full_like(before, config.prior * (32 / nodes) ** 2)
         carved = free & (distance < bound)
         target[carved], weight[carved] = bound[carved], config.free_space
         carved = through & (distance < 2 * h)
         target[carved], weight[carved] = 2 * h, config.seen_through
+        carved = bridges & (distance < _PUSHED_CELLS * h)
+        target[carved], weight[carved] = _PUSHED_CELLS * h, config.seen_through
         met_along = inside_along(through_subject, distance, met_along)
         pulled = _FADE * pulled + _pulls(through_subject.chosen(met_along.isinf()), bound)
         rays_near, depths = pulled.reshape(*distance.shape, 2).unbind(-1)
@@ -192,6 +201,18 @@ def _movement(
     """Mean change at the nodes within a cell of the surface, in units of the grid's frame; 0 without any."""
     near = distance.abs() < spacing(len(distance))
     return float((distance - last)[near].abs().mean().nan_to_num())
+
+
+def _before_hidden(shown: ShownPlaces, nodes: int) -> Bool[Tensor, "nodes nodes nodes"]:
+    """Nodes along the rays to hidden places, from a cell before them as far as a bridge may reach."""
+    h, hidden = spacing(nodes), shown.chosen(shown.hidden)
+    along = -h * torch.arange(1.5, 2 * _PUSHED_CELLS + 0.5, 0.5, device=hidden.positions.device)
+    at = points_along(hidden.positions, hidden.directions, along.expand(len(hidden.positions), -1))
+    place = ((at.reshape(-1, 3) + 1) / h).round().long()
+    x, y, z = place[((place >= 0) & (place < nodes)).all(dim=-1)].unbind(-1)
+    before = torch.zeros((nodes, nodes, nodes), dtype=torch.bool, device=at.device)
+    before[x, y, z] = True
+    return before
 
 
 def _pulls(missed: SilhouetteRays, bound: Float[Tensor, "nodes nodes nodes"]) -> Float[Tensor, "cells 2"]:

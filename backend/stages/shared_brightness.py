@@ -82,6 +82,8 @@ _SURE_DEVIATION = 0.002
 """Of the depth of a sure stereo point, in half widths of the grid; what is as good weighs as much."""
 _LARGEST_DEVIATION = 0.02
 """Of a depth that is told."""
+_SURELY = 6.0
+"""Deviations by which a field has to be too near for that to be sure."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -94,6 +96,10 @@ class ShownPlaces(Rows):
     """Beside a sure stereo point, 0 to 1."""
     mirrored: Float[Tensor, "points"]
     """Difference of brightness, in linear light, that was taken off because it is mirrored light."""
+    directions: Float[Tensor, "points 3"]
+    """Away from the photograph that each was asked of, of unit length."""
+    hidden: Bool[Tensor, "points"]
+    """Whether the field was surely too near there: what it has before the place is a bridge."""
 
 
 def shared_brightness(
@@ -331,6 +337,8 @@ def _told(pair: _Compared, matt_noise: Float[Tensor, "channels"], shine: Shine |
         normals=places.normals,
         weights=(_SURE_DEVIATION / deviation).square().clamp(max=1.0),
         mirrored=(pair.difference - matt)[0].flatten()[places.pixel].abs(),
+        directions=places.directions,
+        hidden=step > _SURELY * deviation,
     )
 
 
@@ -346,4 +354,11 @@ def _off_outlines(scene: Measurements, shown: ShownPlaces) -> ShownPlaces:
 
 def _nothing() -> ShownPlaces:
     places, numbers = torch.zeros((0, 3)), torch.zeros(0)
-    return ShownPlaces(positions=places, normals=places, weights=numbers, mirrored=numbers)
+    return ShownPlaces(
+        positions=places,
+        normals=places,
+        weights=numbers,
+        mirrored=numbers,
+        directions=places,
+        hidden=torch.zeros(0, dtype=torch.bool),
+    )

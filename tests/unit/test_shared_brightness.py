@@ -282,6 +282,53 @@ def test_what_is_told_last_stands_in_place_of_what_was_told_before() -> None:
     torch.testing.assert_close(*fields, rtol=0, atol=1e-6)
 
 
+@pytest.mark.parametrize(
+    ("by", "share"), [(2.5 * spacing(NODES), (0.8, 1.0)), (0.1 * spacing(NODES), (0, 0)), (-0.06, (0, 0))]
+)
+def test_what_a_field_surely_hides_lies_well_behind_it(by: float, share: tuple[float, float]) -> None:
+    """Above, where the field is off by all of it."""
+    told = shared_brightness(scene(), too_large(by))
+    above = told.chosen(told.positions[:, 1] > 0.15)
+    assert len(above.weights) > 500
+    assert share[0] <= above.hidden.float().mean() <= share[1]
+    towards = torch.stack([F.normalize(told.positions - camera(a).position, dim=-1) for a in (-12, 12)])
+    assert (towards * told.directions).sum(dim=-1).amax(dim=0).min() > 0.9999
+
+
+def test_what_is_hidden_is_sure_by_six_deviations() -> None:
+    """A step goes from the field, above a ball that is larger, along the ray; weights tell deviations."""
+    by = 0.75 * spacing(NODES)
+    told = shared_brightness(scene(shine=0.1), too_large(by), may_shine=False)
+    above = told.chosen((told.positions[:, 1] > 0.15) & (told.weights < 1))
+    middle = (above.positions * above.directions).sum(dim=-1)
+    off_middle = above.positions.square().sum(dim=-1) - middle.square()
+    step = middle + ((RADIUS + by) ** 2 - off_middle).clamp(min=0).sqrt()
+    least = 6 * stage._SURE_DEVIATION / above.weights.sqrt()
+    clear = (step / least - 1).abs() > 0.05
+    assert 20 < (~above.hidden[clear]).sum() < above.hidden[clear].sum()
+    assert ((step > least) == above.hidden)[clear].float().mean() > 0.98
+
+
+def test_a_bridge_is_pushed_away_from_before_what_it_hid() -> None:
+    """A field that ends 0.1 before a plane that is told, hardly surely, but on one side as hidden."""
+    h, along = spacing(NODES), torch.linspace(-0.3, 0.3, 40)
+    x, y = torch.meshgrid(along, along, indexing="ij")
+    told = torch.stack([x, y, torch.full_like(x, 0.1)], dim=-1).reshape(-1, 3)
+    count, backward = len(told), torch.tensor([0.0, 0.0, 1.0])
+    places = ShownPlaces(
+        positions=told,
+        normals=-backward.expand(count, 3),
+        weights=torch.full((count,), 1e-3),
+        mirrored=torch.zeros(count),
+        directions=backward.expand(count, 3),
+        hidden=told[:, 0] > 0,
+    )
+    bridge = torch.maximum(-node_positions(NODES, torch.device("cpu"))[..., 2], too_large(0.0))
+    after = fit_level(scene(), bridge, RADIUS, 3, LinearConfig(settled=0.0), ask=lambda _: places, looks=3)
+    pushed, left = (read(after, torch.tensor([[side * 0.15, 0.2, 0.06]])).item() for side in (1, -1))
+    assert left < 0 < 2 * h < pushed
+
+
 @pytest.mark.parametrize("subject_known", [True, False])
 def test_patches_are_textured_by_their_share_of_the_surface(subject_known: bool) -> None:
     """What the photographs show beside the ball counts for nothing, though some of it was measured."""
@@ -309,7 +356,12 @@ def test_brightness_tells_a_share_of_the_surface_cell_by_cell() -> None:
     for height, share in ((-1.0, 1.0), (0.0, 0.5), (0.5 * RADIUS, 0.25)):
         told = ball[ball[:, 1] > height]
         places = ShownPlaces(
-            positions=told, normals=told, weights=torch.ones(len(told)), mirrored=torch.zeros(len(told))
+            positions=told,
+            normals=told,
+            weights=torch.ones(len(told)),
+            mirrored=torch.zeros(len(told)),
+            directions=-told,
+            hidden=torch.zeros(len(told), dtype=torch.bool),
         )
         assert share_told(places, too_large(0.0)) == pytest.approx(share, abs=0.03 + 0.1 * share)
 

@@ -365,7 +365,14 @@ def test_the_last_grid_of_a_plain_subject_is_fitted_as_such(monkeypatch: pytest.
     """From the grid before it hears what brightness told there, and how much of the surface is textured."""
     heard: list[tuple[int, float, int]] = []
     some = torch.tensor([[0.0, 0.0, 0.5], [0.0, 0.5, 0.0]])
-    places = ShownPlaces(positions=some, normals=2 * some, weights=torch.ones(2), mirrored=torch.zeros(2))
+    places = ShownPlaces(
+        positions=some,
+        normals=2 * some,
+        weights=torch.ones(2),
+        mirrored=torch.zeros(2),
+        directions=-2 * some,
+        hidden=torch.zeros(2, dtype=torch.bool),
+    )
 
     def spy(scene: Measurements, before: torch.Tensor, *args: Any, **words: Any) -> torch.Tensor:
         told = words.get("told")
@@ -403,6 +410,8 @@ def test_what_hardly_weighs_is_asked_about_once_on_each_grid(monkeypatch: pytest
             normals=2 * some,
             weights=torch.full((2,), share * measured / 2),
             mirrored=torch.zeros(2),
+            directions=-2 * some,
+            hidden=torch.zeros(2, dtype=torch.bool),
         )
 
         def counted(*field: Any, told: ShownPlaces = told, **how: Any) -> ShownPlaces:
