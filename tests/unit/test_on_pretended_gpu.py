@@ -72,6 +72,7 @@ def test_what_a_pretended_gpu_makes_is_there_until_it_is_moved() -> None:
     assert there.device.type == "cpu"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scene", [with_masks, before_a_wall])
 def test_stereo_and_fit_run_on_a_gpu_as_on_the_cpu(
     scene: Callable[[], Scene], monkeypatch: pytest.MonkeyPatch
