@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, Int, Int64
 from torch import Tensor
 
 from .geometry import Pinhole, inside, sample_image
-from .grid import node_steps, spacing
+from .grid import flat_numbers, node_steps, spacing
 
 _BATCH = 8192
 """Points whose distances to all nodes around them are computed at once: few enough for a core's cache."""
@@ -44,7 +44,7 @@ def point_distances(
     cells = (positions + 1) / h
     near = ((cells > -2) & (cells < nodes + 1)).all(dim=-1)
     offsets = _offsets(-1, 2, positions.device)
-    steps, offset_at = offsets.to(positions.dtype), _flat(offsets, padded)
+    steps, offset_at = offsets.to(positions.dtype), flat_numbers(offsets, padded)
     sums = positions.new_zeros((padded**3, 2))
     batches = (torch.split(column[near], _BATCH) for column in (cells, normals, confidence))
     for place, normal, sure in zip(*batches, strict=True):
@@ -55,19 +55,13 @@ def point_distances(
         apart2 = steps.square().sum(dim=-1) - 2 * f @ steps.T + f.square().sum(dim=-1, keepdim=True)
         # a Gaussian that is twice as wide along the normal as across it
         weight = sure[:, None] * torch.exp((0.75 * along * along - apart2) / spread_cells**2)
-        at = _flat(base.long() + _BEYOND, padded)[:, None] + offset_at
+        at = flat_numbers(base.long() + _BEYOND, padded)[:, None] + offset_at
         terms = torch.stack([weight * along, weight], dim=-1)
         sums.index_add_(0, at.flatten(), terms.flatten(0, 1))
     inner = slice(_BEYOND, _BEYOND + nodes)
     total, weight = sums.reshape(padded, padded, padded, 2)[inner, inner, inner].unbind(-1)
     distance = h * total / weight.clamp(min=1e-6)
     return PointDistances(distance=distance, weight=torch.where(weight > 1e-3, weight, 0.0))
-
-
-def _flat(place: Int[Tensor, "*batch 3"], nodes: int) -> Int[Tensor, "*batch"]:
-    """Numbers of nodes in memory; spelt out, because no GPU multiplies matrices of whole numbers."""
-    x, y, z = place.unbind(-1)
-    return (x * nodes + y) * nodes + z
 
 
 def merged_points(

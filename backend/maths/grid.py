@@ -55,10 +55,15 @@ def cells_of(
     return low.long(), scaled - low
 
 
+def flat_numbers(place: Int[Tensor, "*batch 3"], nodes: int) -> Int[Tensor, "*batch"]:
+    """Of nodes in memory, by their numbers along each axis; no GPU multiplies matrices of whole numbers."""
+    x, y, z = place.unbind(-1)
+    return (x * nodes + y) * nodes + z
+
+
 def locate(points: Float[Tensor, "points 3"], nodes: int) -> Corners:
     """The cell of each point; points outside the cube are moved to its side."""
     base, t = cells_of(points, nodes)
-    flat = (base[:, 0] * nodes + base[:, 1]) * nodes + base[:, 2]
     offsets = torch.tensor(
         [(i * nodes + j) * nodes + k for i in (0, 1) for j in (0, 1) for k in (0, 1)], device=points.device
     )
@@ -71,7 +76,9 @@ def locate(points: Float[Tensor, "points 3"], nodes: int) -> Corners:
     slope_y = (sign[:, None] * (x[:, :, None] * z[:, None, :])[:, :, None]).flatten(1)
     slope_z = (xy[..., None] * sign).flatten(1)
     return Corners(
-        index=flat[:, None] + offsets, weight=weight, slope=torch.stack([slope_x, slope_y, slope_z], dim=-1)
+        index=flat_numbers(base, nodes)[:, None] + offsets,
+        weight=weight,
+        slope=torch.stack([slope_x, slope_y, slope_z], dim=-1),
     )
 
 

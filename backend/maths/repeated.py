@@ -17,8 +17,8 @@ Step = Callable[[State], State]
 def repeated(step: Step, state: State, times: int) -> State:
     """The state after so many steps.
 
-    A step leaves what it is given as it is. All that differs from one step to the next is in the state, whose
-    tensors keep their shapes and, without gradients, their device; it reads nothing back to the CPU.
+    A step leaves what it is given as it is, and reads nothing back to the CPU. All that differs from one step
+    to the next is in the state, whose tensors keep their shapes and have no gradients.
     """
     if state[0].device.type == "cuda" and times > 1:
         return _replayed(step, state, times)

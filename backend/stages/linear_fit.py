@@ -147,13 +147,14 @@ def fit_level(
             else:
                 measured = _near_nodes(_points(scene, config, h / 2, shown), nodes, config)
                 bridges = _before_hidden(shown, nodes) & (measured.weight < _HARDLY_MEASURED)
-        target, weight = before.clone(), torch.full_like(before, config.prior * (32 / nodes) ** 2)
-        carved = free & (distance < bound)
-        target[carved], weight[carved] = bound[carved], config.free_space
-        carved = through & (distance < 2 * h)
-        target[carved], weight[carved] = 2 * h, config.seen_through
-        carved = bridges & (distance < _PUSHED_CELLS * h)
-        target[carved], weight[carved] = _PUSHED_CELLS * h, config.seen_through
+        target, weight = before, torch.full_like(before, config.prior * (32 / nodes) ** 2)
+        for where, least, strength in (
+            (free, bound, config.free_space),
+            (through, 2 * h, config.seen_through),
+            (bridges, _PUSHED_CELLS * h, config.seen_through),
+        ):
+            carved = where & (distance < least)
+            target, weight = torch.where(carved, least, target), torch.where(carved, strength, weight)
         met_along = inside_along(through_subject, distance, met_along)
         pulled = _FADE * pulled + _pulls(through_subject.chosen(met_along.isinf()), bound)
         rays_near, depths = pulled.reshape(*distance.shape, 2).unbind(-1)

@@ -119,7 +119,7 @@ def shared_brightness(
         if (compared := _compared(picture, pictures[other], len(distance))) is not None
     ]
     if not compared:
-        return _nothing()
+        return _nothing(distance.device)
     boxes = together([pair.boxes for pair in compared])
     noise = deviations(boxes.difference[boxes.sure])
     shine = mirrored_by(boxes, noise, compared[0].cell) if may_shine else None
@@ -352,13 +352,13 @@ def _off_outlines(scene: Measurements, shown: ShownPlaces) -> ShownPlaces:
     return shown.chosen(kept)
 
 
-def _nothing() -> ShownPlaces:
-    places, numbers = torch.zeros((0, 3)), torch.zeros(0)
+def _nothing(device: torch.device) -> ShownPlaces:
+    places, numbers = torch.zeros((0, 3), device=device), torch.zeros(0, device=device)
     return ShownPlaces(
         positions=places,
         normals=places,
         weights=numbers,
         mirrored=numbers,
         directions=places,
-        hidden=torch.zeros(0, dtype=torch.bool),
+        hidden=torch.zeros_like(numbers, dtype=torch.bool),
     )
