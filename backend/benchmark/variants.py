@@ -45,6 +45,7 @@ def _changed(settings: Any, name: str, value: object) -> Any:
 VARIANTS = (
     Variant(name="as it is"),
     # what stereo points are, and what they weigh
+    Variant(name="without a second sweep", changes={"stereo.sweep_again": False}),
     Variant(name="without growth", changes={"stereo.growth_rounds": (0, 0, 0)}),
     Variant(name="without semi-global matching", changes={"stereo.semi_global": False}),
     Variant(name="full size alone", changes={"stereo.trust_of_half_size": 0.0}),

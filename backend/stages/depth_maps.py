@@ -1,24 +1,14 @@
 """Depth maps in the making: swept where images are small, then refined and grown, finer and finer."""
 
-import math
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
-import numpy as np
 import torch
 import torch.nn.functional as F
 from jaxtyping import Bool, Float, Shaped
 from torch import Tensor
 
 from ..maths.correlation import window_mean, window_sum
-from ..maths.geometry import (
-    Pinhole,
-    epipolar_map,
-    match_speed_px,
-    pixel_centres,
-    sample_image,
-    unproject,
-)
+from ..maths.geometry import pixel_centres, sample_image, unproject
 from ..maths.inverse_depth import (
     distance_from_edges_px,
     fit_planes,
@@ -26,17 +16,15 @@ from ..maths.inverse_depth import (
     piece_sizes,
 )
 from ..maths.median import median_3x3
-from ..maths.semi_global import aggregate
 from ..scene import Progress, within
 from .cross_check import cross_check
 from .patch_agreement import agreement
+from .plane_sweep import Map, better_of, inverse_depth_range, step_of_one_pixel, sweep, swept_again
 from .stereo_config import StereoConfig
 from .stereo_windows import Window, views_between
 
 _LEAST_FOR_A_PLANE = 12
 """Seeds in a window that make its plane worth continuing."""
-_FARTHEST = 0.02
-"""Of the inverse depth at the region's end: nothing farther off moves between photographs."""
 _AS_GOOD = 0.03
 """Of the correlation: texture that repeats agrees as well behind the region as where it is."""
 _LARGEST_STEP_PX = 2.0
@@ -45,17 +33,6 @@ _LARGEST_STEP_PX = 2.0
 A patch that reaches over a jump is matched by the edge there, and what lies behind gets the depth of what
 stands before it. The subject's outline is such an edge, and another place of the surface in every view.
 """
-
-
-@dataclass(frozen=True, kw_only=True)
-class Map:
-    """A depth map in the making."""
-
-    window: Window
-    inverse_depth: Float[Tensor, "height width"]
-    score: Float[Tensor, "height width"]
-    behind: Float[Tensor, "height width"]
-    """How well patches agree behind the region, where that was better than anything in it; else 0."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -91,13 +68,19 @@ def depth_maps(
         for index, (window, near) in enumerate(zip(windows, sources, strict=True)):
             tell(0.3 * index / len(windows), f"depth of photograph {index + 1}")
             if level == top:
-                maps.append(_sweep(window, near, config))
+                maps.append(sweep(window, near, config))
             elif maps[index].window is not window:
                 maps[index] = _enlarged(maps[index], window)
-            maps[index] = _refined(maps[index], near, [1.0, 0.5], config)
+            # how well patches agree where photographs are smaller says nothing of how they do here
+            maps[index] = _refined(maps[index], near, 1.0, config)
+            maps[index] = _improved(maps[index], near, [0.5], config)
+        if level == 0 and config.sweep_again:
+            maps = _swept_again(maps, sources, nearby, config, within(tell, 0.3, 0.5))
         rounds = config.growth_rounds[min(level, 2)]
-        maps = _grown_together(maps, sources, nearby, rounds, config, within(tell, 0.3, 1.0))
-        sharp = [_refined(m, near, [0.25, 0.125], config) for m, near in zip(maps, sources, strict=True)]
+        maps = _grown_together(maps, sources, nearby, rounds, config, within(tell, 0.5, 1.0))
+        sharp = [
+            _improved(map_, near, [0.25, 0.125], config) for map_, near in zip(maps, sources, strict=True)
+        ]
         votes = [_votes(index, sharp, nearby, config) for index in range(len(sharp))]
         by_size.insert(0, [_measured(*one, config) for one in zip(sharp, votes, sources, strict=True)])
     return [_each_once(list(sizes)) for sizes in zip(*by_size, strict=True)]
@@ -114,6 +97,24 @@ def _each_once(sizes: list[Measured]) -> list[Measured]:
         once.append(replace(coarse, votes=torch.where(known, 0.0, coarse.votes)))
         known = known | (coarse.votes > 0)
     return once
+
+
+def _swept_again(
+    maps: list[Map],
+    sources: list[list[Window]],
+    nearby: list[list[int]],
+    config: StereoConfig,
+    progress: Progress,
+) -> list[Map]:
+    """All depths tried again where views agree on nothing."""
+    windows = [map_.window for map_ in maps]
+    measured = [_votes(index, maps, nearby, config) > 0 for index in range(len(maps))]
+    again = []
+    for index, near in enumerate(sources):
+        progress(index / len(maps), f"depth of photograph {index + 1}")
+        swept = swept_again(maps[index], measured[index], near, windows, config)
+        again.append(_improved(swept, near, [0.5], config))
+    return again
 
 
 def _grown_together(
@@ -145,7 +146,7 @@ def _grown(
     slanted planes as in PatchMatch Stereo (Bleyer, Rhemann & Rother 2011), from pixels that are sure alone.
     """
     window, reach = current.window, config.growth_reach_px
-    near, far = _inverse_depth_range(window.camera)
+    near, far = inverse_depth_range(window.camera)
     radius = config.patch_radius + 1
     planes = fit_planes(current.inverse_depth, seeds * current.score.clamp(min=0) ** 2, radius)
     known = window_sum(seeds.float(), radius) >= _LEAST_FOR_A_PLANE
@@ -165,7 +166,7 @@ def _grown(
         inverse_depth=torch.where(better, chosen, current.inverse_depth),
         score=torch.where(better, score, current.score),
     )
-    return _refined(grown, sources, [0.5], config)
+    return _improved(grown, sources, [0.5], config)
 
 
 def _moved(
@@ -175,87 +176,28 @@ def _moved(
     return values.roll((-dv, -du), dims=(-2, -1))
 
 
-def _sweep(window: Window, sources: list[Window], config: StereoConfig) -> Map:
-    """Best plane of every pixel, after semi-global matching where asked for, to a fraction of a step."""
-    if not sources:
-        nothing = torch.zeros_like(window.grey)
-        return Map(window=window, inverse_depth=nothing, score=nothing, behind=nothing)
-    near, far = _inverse_depth_range(window.camera)
-    maps = [epipolar_map(source.camera, window.camera) for source in sources]
-    step = min(float(_step_of_one_pixel(window, [m], (near + far) / 2).median()) for m in maps)
-    count = int(np.clip(math.ceil((near - far) / step), 16, config.num_planes)) + 1
-    planes = torch.linspace(far, near, count, device=window.grey.device)
-    score = torch.cat(list(_scores(window, sources, planes)))
-    cost = (1 - score).permute(1, 2, 0).contiguous()
-    if config.semi_global:
-        gradient = window.grey.diff(dim=0, append=window.grey[-1:]).abs()
-        gradient += window.grey.diff(dim=1, append=window.grey[:, -1:]).abs()
-        large_step = 0.3 + 0.7 * torch.exp(-gradient / 0.04)
-        cost = aggregate(cost, 0.08, large_step)
-    index, offset = lowest_with_neighbours(cost)
-    inverse_depth = planes[index] + offset * (planes[1] - planes[0])
-    best = score.permute(1, 2, 0).gather(-1, index[..., None])[..., 0]
-    behind = torch.zeros_like(best)
-    if window.surrounded:
-        # as many depths again: a pixel whose own is not among those tried agrees with another by chance
-        farther = far - (planes - far)[1:]
-        for scores in _scores(window, sources, farther[farther > _FARTHEST * far]):
-            behind = behind.maximum(scores.max(dim=0).values)
-        behind = torch.where(behind > score.max(dim=0).values, behind, 0.0)
-    return Map(window=window, inverse_depth=inverse_depth, score=best, behind=behind)
+def _improved(current: Map, sources: list[Window], steps_px: list[float], config: StereoConfig) -> Map:
+    """Refined by steps of each width, but where patches agreed better before: what is narrow is not flat."""
+    for step_px in steps_px:
+        current = better_of(current, _refined(current, sources, step_px, config))
+    return current
 
 
-def _scores(
-    window: Window, sources: list[Window], planes: Float[Tensor, "planes"]
-) -> Iterator[Float[Tensor, "some_planes height width"]]:
-    """How well patches agree at every pixel at each inverse depth, a few of them at a time."""
-    for first in range(0, len(planes), 16):
-        hypotheses = planes[first : first + 16, None, None].expand(-1, *window.grey.shape)
-        yield agreement(window, sources, hypotheses, window.subject)
-
-
-def _inverse_depth_range(camera: Pinhole) -> tuple[float, float]:
-    """(nearest, farthest) inverse depth of the unit sphere, kept in front of the camera.
-
-    Farther by up to a radius, where surroundings find room; no more, because seen through a long lens the
-    sphere is a small share of its distance, and the steps are shared out over all that is searched.
-    """
-    middle = float(camera.camera_from_object[2, 3])
-    nearest = max(middle - 1.0, 0.05 * (middle + 1.0), 1e-3)
-    return 1 / nearest, 1 / max(middle + 1.0, min(2 * nearest, max(middle + 2.0, 2e-3)))
-
-
-def _step_of_one_pixel(
-    window: Window, maps: list[tuple[Tensor, Tensor]], inverse_depth: Float[Tensor, "height width"] | float
-) -> Float[Tensor, "height width"]:
-    """The change of inverse depth that moves the match by one pixel in the source where it moves most."""
-    pixels = pixel_centres(window.camera.width, window.camera.height, window.grey.device)
-    w = torch.as_tensor(inverse_depth, device=window.grey.device).expand(window.grey.shape)
-    speed = torch.zeros_like(window.grey)
-    for a, b in maps:
-        speed = torch.maximum(speed, match_speed_px(a, b, pixels, w))
-    return 1 / speed.clamp(min=1e-6)
-
-
-def _refined(current: Map, sources: list[Window], steps_px: list[float], config: StereoConfig) -> Map:
-    """Five hypotheses around planes fitted to the map so far, once for each step width."""
+def _refined(current: Map, sources: list[Window], step_px: float, config: StereoConfig) -> Map:
+    """The best of five hypotheses, steps of that width apart, around planes fitted to the map so far."""
     if not sources:
         return current
     window = current.window
-    maps = [epipolar_map(source.camera, window.camera) for source in sources]
-    near, far = _inverse_depth_range(window.camera)
+    near, far = inverse_depth_range(window.camera)
     offsets = torch.arange(-2, 3, device=window.grey.device)[:, None, None]
-    for step_px in steps_px:
-        middle = _smoothed(current, config.patch_radius)
-        step = step_px * _step_of_one_pixel(window, maps, middle)
-        hypotheses = (middle + offsets * step).clamp(far, near)
-        score = agreement(window, sources, hypotheses, window.subject)
-        best = score.max(dim=0).values
-        index, offset = lowest_with_neighbours(1 - score.permute(1, 2, 0))
-        better = (middle + (index - 2 + offset) * step).clamp(far, near)
-        # what no source sees is not moved
-        current = replace(current, inverse_depth=torch.where(best > -1, better, middle), score=best)
-    return current
+    middle = _smoothed(current, config.patch_radius)
+    step = step_px * step_of_one_pixel(window, sources, middle)
+    score = agreement(window, sources, (middle + offsets * step).clamp(far, near), window.subject)
+    best = score.max(dim=0).values
+    index, offset = lowest_with_neighbours(1 - score.permute(1, 2, 0))
+    better = (middle + (index - 2 + offset) * step).clamp(far, near)
+    # what no source sees is not moved
+    return replace(current, inverse_depth=torch.where(best > -1, better, middle), score=best)
 
 
 def _sharpness(
@@ -303,8 +245,7 @@ def _measured(
     if not sources:
         nothing = torch.zeros_like(votes)
         return Measured(map=current, votes=nothing, sharpness=nothing, from_edge_px=nothing)
-    maps = [epipolar_map(source.camera, current.window.camera) for source in sources]
-    step = _step_of_one_pixel(current.window, maps, current.inverse_depth)
+    step = step_of_one_pixel(current.window, sources, current.inverse_depth)
     sharpness = _sharpness(current, step, sources, config)
     largest_step = _LARGEST_STEP_PX * step
     from_edge_px = distance_from_edges_px(current.inverse_depth, current.window.subject, largest_step)

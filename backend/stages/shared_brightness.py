@@ -84,6 +84,8 @@ _LARGEST_DEVIATION = 0.02
 """Of a depth that is told."""
 _SURELY = 6.0
 """Deviations by which a field has to be too near for that to be sure."""
+_BRIDGED_CELLS = 0.5
+"""By which it has to be too near as well: less is not a bridge but what the next round mends."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -338,7 +340,7 @@ def _told(pair: _Compared, matt_noise: Float[Tensor, "channels"], shine: Shine |
         weights=(_SURE_DEVIATION / deviation).square().clamp(max=1.0),
         mirrored=(pair.difference - matt)[0].flatten()[places.pixel].abs(),
         directions=places.directions,
-        hidden=step > _SURELY * deviation,
+        hidden=(step > _SURELY * deviation) & (step > _BRIDGED_CELLS * pair.cell),
     )
 
 

@@ -17,6 +17,8 @@ class StereoConfig:
     """Depths tried there, at most."""
     semi_global: bool = True
     """Whether depth is made smooth there; else each pixel chooses for itself."""
+    sweep_again: bool = True
+    """Whether all depths are tried again, at the first size, where nothing was measured so far."""
     patch_radius: int = 3
     """Half width of the patches, in pixels of the size at hand."""
     min_correlation: float = 0.3

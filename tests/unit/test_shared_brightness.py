@@ -283,7 +283,7 @@ def test_what_is_told_last_stands_in_place_of_what_was_told_before() -> None:
 
 
 @pytest.mark.parametrize(
-    ("by", "share"), [(2.5 * spacing(NODES), (0.8, 1.0)), (0.1 * spacing(NODES), (0, 0)), (-0.06, (0, 0))]
+    ("by", "share"), [(2.5 * spacing(NODES), (0.8, 1.0)), (0.25 * spacing(NODES), (0, 0.1)), (-0.06, (0, 0))]
 )
 def test_what_a_field_surely_hides_lies_well_behind_it(by: float, share: tuple[float, float]) -> None:
     """Above, where the field is off by all of it."""

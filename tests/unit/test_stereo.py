@@ -85,7 +85,10 @@ def test_surface_that_turns_away_is_grown_from_its_neighbour() -> None:
     wide = photographed(arc_cameras(3, 40, 320))
     swept, grown = (
         match_views(wide.views, true_region(), config, device=torch.device("cpu"), progress=no_progress)
-        for config in (StereoConfig(growth_rounds=(0, 0, 0)), StereoConfig())
+        for config in (
+            StereoConfig(sweep_again=False, growth_rounds=(0, 0, 0)),
+            StereoConfig(sweep_again=False),
+        )
     )
     missed = [
         np.mean([1 - (m.depth > 0)[on].mean() for m, on in zip(found.depth_maps, wide.coverage, strict=True)])
