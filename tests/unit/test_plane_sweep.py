@@ -1,0 +1,215 @@
+"""Depths tried again: found where they were missed, left alone where they were measured or cannot be."""
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from backend.maths.raycast import RayCaster, camera_rays
+from backend.scene import Camera, StereoResult, View, no_progress
+from backend.stages.patch_agreement import agreement
+from backend.stages.plane_sweep import Map, better_of, inverse_depth_range, step_of_one_pixel, swept_again
+from backend.stages.stereo import match_views
+from backend.stages.stereo_config import StereoConfig
+from backend.stages.stereo_windows import Window, pyramid
+from tests.synthetic_scene import (
+    CENTRE,
+    OBJECT_UNIT,
+    SIZE,
+    arc_cameras,
+    camera_at,
+    photographed,
+    texture_srgb,
+    true_region,
+)
+
+CONFIG = StereoConfig()
+
+
+@cache
+def windows() -> list[Window]:
+    views = photographed(arc_cameras(3, 30, 320)).views
+    return [pyramid(view, true_region(), CONFIG, torch.device("cpu"))[0] for view in views]
+
+
+@cache
+def truth() -> Tensor:
+    """Inverse depth of the middle window; 0 off the body."""
+    window, depth = windows()[1], photographed(arc_cameras(3, 30, 320)).depths[1]
+    height, width = window.grey.shape
+    part = depth[window.top : window.top + height, window.left : window.left + width]
+    return torch.tensor(OBJECT_UNIT / part, dtype=torch.float32)
+
+
+def half_right(behind: float = 0.0) -> tuple[Map, Tensor]:
+    """Measured and true on the left of the middle; on the right at the far end, where nothing agrees."""
+    window, known = windows()[1], torch.zeros_like(truth(), dtype=torch.bool)
+    known[:, : known.shape[1] // 2] = True
+    known &= window.subject
+    far = torch.full_like(truth(), inverse_depth_range(window.camera)[1])
+    one = Map(
+        window=window,
+        inverse_depth=torch.where(known, truth(), far),
+        score=torch.where(known, 0.9, 0.1),
+        behind=torch.full_like(truth(), behind),
+    )
+    return one, known
+
+
+def again(one: Map, known: Tensor, others: list[Window]) -> Map:
+    return swept_again(one, known, [windows()[0], windows()[2]], others, CONFIG)
+
+
+def test_what_was_missed_is_found_and_what_was_measured_is_left() -> None:
+    """Within a pixel of disparity; planes that face the camera do not fit what turns away from it."""
+    one, known = half_right()
+    found = again(one, known, windows())
+    step = step_of_one_pixel(one.window, [windows()[0], windows()[2]], truth().clamp(min=1e-3))
+    missed = one.window.subject & ~known & (truth() > 0)
+    right = (found.inverse_depth - truth()).abs() < step
+    assert missed.sum() > 5000
+    assert not ((one.inverse_depth - truth()).abs() < step)[missed].any()
+    assert right[missed].float().mean() > 0.75
+    assert (found.inverse_depth == one.inverse_depth)[known].float().mean() > 0.99
+    # what took another's place agrees better, and as well as it says
+    took = found.inverse_depth != one.inverse_depth
+    assert (found.score > one.score + 0.04)[took].all()
+    assert (found.score[took] > CONFIG.growth_correlation).all()
+
+
+@pytest.mark.parametrize("seen", ["as it is", "off the subject", "only at its edge", "surrounded"])
+def test_nothing_is_found_where_another_photograph_shows_that_nothing_is_there(seen: str) -> None:
+    one, known = half_right()
+    left, middle, right = windows()
+    match seen:
+        case "off the subject":
+            right = replace(right, subject=torch.zeros_like(right.subject))
+        case "only at its edge":  # two pixels off: so far cameras may be wrong
+            right = replace(right, subject=right.subject.roll(2, 0) & right.subject)
+        case "surrounded":
+            right = replace(right, subject=torch.zeros_like(right.subject), surrounded=True)
+    found = again(one, known, [left, middle, right])
+    expected = again(one, known, windows())
+    changed, usually = (int((map_.inverse_depth != one.inverse_depth).sum()) for map_ in (found, expected))
+    assert usually > 5000
+    assert changed == (0 if seen == "off the subject" else pytest.approx(usually, rel=0.001))
+
+
+def without_texture(one: Map, known: Tensor) -> tuple[Map, Tensor]:
+    patches = replace(one.window.patches, variance=torch.zeros_like(truth()))
+    return replace(one, window=replace(one.window, patches=patches)), known
+
+
+def better_behind(one: Map, known: Tensor) -> tuple[Map, Tensor]:
+    return replace(one, behind=torch.where(known, 0.0, 0.8)), known
+
+
+def all_but_a_line(one: Map, known: Tensor) -> tuple[Map, Tensor]:
+    """Three pixels wide, as beside a jump."""
+    column = known.shape[1] // 2
+    known = one.window.subject.clone()
+    known[:, column : column + 3] = False
+    return replace(one, score=torch.where(known, 0.9, 0.1)), known
+
+
+def hardly_anything(one: Map, known: Tensor) -> tuple[Map, Tensor]:
+    return one, known & (known.flatten().cumsum(0).view_as(known) < 50)
+
+
+@pytest.mark.parametrize("change", [without_texture, better_behind, all_but_a_line, hardly_anything])
+def test_what_is_not_asked_stays_as_it_is(change) -> None:  # type: ignore[no-untyped-def]
+    one, known = change(*half_right())
+    assert torch.equal(again(one, known, windows()).inverse_depth, one.inverse_depth)
+
+
+def test_alone_a_view_stays_as_it_is() -> None:
+    one, known = half_right()
+    assert swept_again(one, known, [], windows(), CONFIG) is one
+
+
+def test_the_better_of_two_keeps_what_agreed_clearly_better() -> None:
+    one, _ = half_right()
+    score = torch.full_like(truth(), 0.5)
+    score[0], score[1] = 0.52, 0.6
+    before = replace(one, score=score, inverse_depth=torch.full_like(truth(), 1.0))
+    after = replace(one, score=torch.full_like(truth(), 0.5), inverse_depth=torch.full_like(truth(), 2.0))
+    found = better_of(before, after)
+    assert (found.inverse_depth[1] == 1).all()
+    assert (found.score[1] == 0.6).all()
+    assert (found.inverse_depth[0] == 2).all()
+    assert (found.inverse_depth[2:] == 2).all()
+    assert (found.score[0] == 0.5).all()
+
+
+# a board with a slot, and a wall behind it: what is narrow, and behind an edge on either side
+
+SLOT = 0.065 * SIZE
+"""Half its height: eight pixels."""
+WALL_BEHIND = 0.7 * SIZE
+
+
+def board_and_wall() -> RayCaster:
+    """The board above and below the slot, and the wall behind it and beside it, across y."""
+    y, width, height = CENTRE[1] - 0.3 * SIZE, 0.5 * SIZE, 0.6 * SIZE
+    bands = [(y, width, SLOT, height), (y, width, -height, -SLOT)]
+    bands.append((y + WALL_BEHIND, 1.6 * width, -height, height))
+    corners = [
+        [CENTRE[0] + side, depth, CENTRE[2] + z]
+        for depth, wide, low, high in bands
+        for side, z in ((-wide, low), (wide, low), (wide, high), (-wide, high))
+    ]
+    faces = np.array([[0, 1, 2], [0, 2, 3]])
+    return RayCaster(np.array(corners), np.concatenate([faces + 4 * k for k in range(len(bands))]))
+
+
+def seen(camera: Camera, index: int) -> tuple[View, np.ndarray]:
+    """The view, and the depth of the wall where it is seen through the slot."""
+    origins, directions = camera_rays(camera)
+    hits, shape = board_and_wall().cast(origins, directions), (camera.height, camera.width)
+    image, depth = np.zeros((len(origins), 3), np.float32), np.full(len(origins), np.nan)
+    points = origins[hits.hit] + hits.distance[hits.hit, None] * directions[hits.hit]
+    image[hits.hit] = texture_srgb(points)
+    on_wall = hits.face >= 4
+    through = origins[on_wall] + hits.distance[on_wall, None] * directions[on_wall]
+    x, z = np.abs(through - CENTRE)[:, [0, 2]].T
+    within = (z < 0.5 * SIZE) & (x < 0.35 * SIZE)
+    along = (through - camera.position) @ camera.camera_from_world[2, :3] / OBJECT_UNIT
+    depth[on_wall] = np.where(within, along, np.nan)
+    mask = hits.hit.reshape(shape).astype(np.float32)
+    view = View(name=f"{index}.png", camera=camera, image_srgb=image.reshape(*shape, 3), mask=mask)
+    return view, depth.reshape(shape)
+
+
+def matched(views: tuple[View, ...], config: StereoConfig) -> StereoResult:
+    return match_views(views, true_region(), config, device=torch.device("cpu"), progress=no_progress)
+
+
+def test_what_lies_behind_a_slot_is_measured() -> None:
+    cameras = [camera_at(azimuth, 0.0, 320) for azimuth in (-10, 0, 10)]
+    views, depths = zip(*(seen(camera, i) for i, camera in enumerate(cameras)), strict=True)
+    shares = []
+    for sweep_again in (False, True):
+        found = matched(views, StereoConfig(sweep_again=sweep_again, coarse_pixels=5_000, min_piece_px=50))
+        through = [np.isfinite(depth) for depth in depths]
+        assert min(there.sum() for there in through) > 300
+        right = [
+            (np.abs(map_.depth / depth - 1) < 0.01)[there]
+            for map_, depth, there in zip(found.depth_maps, depths, through, strict=True)
+        ]
+        shares.append(float(np.concatenate(right).mean()))
+    assert shares[1] > 2 * shares[0], shares
+    assert shares[1] > 0.4, shares
+
+
+def test_depths_that_are_found_agree_as_their_score_says() -> None:
+    one, known = half_right()
+    found = again(one, known, windows())
+    took = found.inverse_depth != one.inverse_depth
+    # where all around was found as well, its own depth at each pixel is about one plane
+    scores = agreement(
+        one.window, [windows()[0], windows()[2]], found.inverse_depth[None], one.window.subject
+    )[0]
+    assert (scores - found.score).abs()[took].median() < 0.1
