@@ -33,8 +33,9 @@ _AT_A_TIME = 16
 """Planes that are compared before the next are thought of."""
 _FARTHEST = 0.02
 """Of the inverse depth at the region's end: nothing farther off moves between photographs."""
-_TEXTURED = 3.0
-"""Contrast of a patch, in deviations of noise, from which all depths are tried again."""
+_TEXTURED = 6.0
+"""Contrast of a patch, in deviations of noise, from which all depths are tried again: of many, one agrees by
+chance."""
 _AGREES_BETTER = 0.05
 """By that much it has to, at a depth that takes the place of another."""
 _FEWEST_MEASURED = 100

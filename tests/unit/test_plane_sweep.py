@@ -68,11 +68,12 @@ def test_what_was_missed_is_found_and_what_was_measured_is_left() -> None:
     one, known = half_right()
     found = again(one, known, windows())
     step = step_of_one_pixel(one.window, [windows()[0], windows()[2]], truth().clamp(min=1e-3))
-    missed = one.window.subject & ~known & (truth() > 0)
+    textured = one.window.patches.variance.sqrt() > 6 * one.window.noise
+    missed = one.window.subject & ~known & (truth() > 0) & textured
     right = (found.inverse_depth - truth()).abs() < step
     assert missed.sum() > 5000
     assert not ((one.inverse_depth - truth()).abs() < step)[missed].any()
-    assert right[missed].float().mean() > 0.75
+    assert right[missed].float().mean() > 0.65
     assert (found.inverse_depth == one.inverse_depth)[known].float().mean() > 0.99
     # what took another's place agrees better, and as well as it says
     took = found.inverse_depth != one.inverse_depth
@@ -99,7 +100,8 @@ def test_nothing_is_found_where_another_photograph_shows_that_nothing_is_there(s
 
 
 def without_texture(one: Map, known: Tensor) -> tuple[Map, Tensor]:
-    patches = replace(one.window.patches, variance=torch.zeros_like(truth()))
+    """Five deviations of noise."""
+    patches = replace(one.window.patches, variance=torch.full_like(truth(), (5 * one.window.noise) ** 2))
     return replace(one, window=replace(one.window, patches=patches)), known
 
 
@@ -107,11 +109,9 @@ def better_behind(one: Map, known: Tensor) -> tuple[Map, Tensor]:
     return replace(one, behind=torch.where(known, 0.0, 0.8)), known
 
 
-def all_but_a_line(one: Map, known: Tensor) -> tuple[Map, Tensor]:
-    """Three pixels wide, as beside a jump."""
-    column = known.shape[1] // 2
-    known = one.window.subject.clone()
-    known[:, column : column + 3] = False
+def all_but_lines(one: Map, known: Tensor) -> tuple[Map, Tensor]:
+    """Three pixels wide, as beside jumps."""
+    known = one.window.subject & (torch.arange(known.shape[1]) % 20 > 2)
     return replace(one, score=torch.where(known, 0.9, 0.1)), known
 
 
@@ -119,7 +119,7 @@ def hardly_anything(one: Map, known: Tensor) -> tuple[Map, Tensor]:
     return one, known & (known.flatten().cumsum(0).view_as(known) < 50)
 
 
-@pytest.mark.parametrize("change", [without_texture, better_behind, all_but_a_line, hardly_anything])
+@pytest.mark.parametrize("change", [without_texture, better_behind, all_but_lines, hardly_anything])
 def test_what_is_not_asked_stays_as_it_is(change) -> None:  # type: ignore[no-untyped-def]
     one, known = change(*half_right())
     assert torch.equal(again(one, known, windows()).inverse_depth, one.inverse_depth)
@@ -132,16 +132,17 @@ def test_alone_a_view_stays_as_it_is() -> None:
 
 def test_the_better_of_two_keeps_what_agreed_clearly_better() -> None:
     one, _ = half_right()
-    score = torch.full_like(truth(), 0.5)
-    score[0], score[1] = 0.52, 0.6
-    before = replace(one, score=score, inverse_depth=torch.full_like(truth(), 1.0))
-    after = replace(one, score=torch.full_like(truth(), 0.5), inverse_depth=torch.full_like(truth(), 2.0))
-    found = better_of(before, after)
-    assert (found.inverse_depth[1] == 1).all()
-    assert (found.score[1] == 0.6).all()
-    assert (found.inverse_depth[0] == 2).all()
-    assert (found.inverse_depth[2:] == 2).all()
-    assert (found.score[0] == 0.5).all()
+    after = torch.full_like(truth(), 0.6)
+    before = after.clone()
+    before[0], before[1] = 0.7, 0.62
+    found = better_of(
+        replace(one, score=before, inverse_depth=torch.full_like(truth(), 1.0)),
+        replace(one, score=after, inverse_depth=torch.full_like(truth(), 2.0)),
+    )
+    assert (found.inverse_depth[0] == 1).all()
+    assert (found.inverse_depth[1:] == 2).all()
+    assert torch.equal(found.score[0], before[0])
+    assert torch.equal(found.score[1:], after[1:])
 
 
 # a board with a slot, and a wall behind it: what is narrow, and behind an edge on either side
