@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float, Shaped
 from torch import Tensor
 
 from ..maths.correlation import window_mean, window_sum
-from ..maths.geometry import pixel_centres, sample_image, unproject
+from ..maths.geometry import inside, pixel_centres, project, sample_image, unproject
 from ..maths.inverse_depth import (
     distance_from_edges_px,
     fit_planes,
@@ -27,6 +27,8 @@ _LEAST_FOR_A_PLANE = 12
 """Seeds in a window that make its plane worth continuing."""
 _AS_GOOD = 0.03
 """Of the correlation: texture that repeats agrees as well behind the region as where it is."""
+_UNCONFIRMED = 0.25
+"""What a view's agreement counts past one between that sees the place as well and has not found it."""
 _LARGEST_STEP_PX = 2.0
 """Of the match, from a pixel to the next, on one surface: a limit of its gradient (Burt & Julesz 1980).
 
@@ -41,7 +43,7 @@ class Measured:
 
     map: Map
     votes: Float[Tensor, "height width"]
-    """How many views agree, the own one counted; 0 where nothing is measured."""
+    """How many views agree, the own one counted, perhaps a quarter for another; 0: not measured."""
     sharpness: Float[Tensor, "height width"]
     """How much the agreement of patches drops one pixel of disparity off, to either side."""
     from_edge_px: Float[Tensor, "height width"]
@@ -266,7 +268,7 @@ def _votes(
     """How many views agree with each pixel's depth (itself counted), 0 where it is not a measurement.
 
     What two views see, a view between them sees as well. If it is compared, and has found another depth
-    there, the two agree by chance.
+    there, the two agree by chance; if it has found none, perhaps.
     """
     own = maps[index]
     pixels = pixel_centres(own.window.camera.width, own.window.camera.height, own.window.grey.device)
@@ -290,12 +292,15 @@ def _votes(
     cameras = [map_.window.camera for map_ in maps]
     votes = torch.ones_like(own.inverse_depth)
     for other, (agrees, _) in said.items():
-        confirmed, denied = torch.zeros_like(agrees), torch.zeros_like(agrees)
+        confirmed, denied, seen = (torch.zeros_like(agrees) for _ in range(3))
         for between in views_between(cameras, index, other):
             if between in said:
                 confirmed |= said[between][0]
                 denied |= said[between][1]
-        votes += agrees & (confirmed | ~denied)
+                at, in_front = project(cameras[between], points)
+                seen |= inside(at, cameras[between].width, cameras[between].height) & (in_front > 0)
+        vote = torch.where(seen & ~confirmed, _UNCONFIRMED, 1.0)
+        votes += vote * (agrees & (confirmed | ~denied))
     enough = (own.behind - _AS_GOOD).clamp(min=config.min_correlation)
     good = own.window.subject & (own.score > enough) & (points.norm(dim=-1) < 1.0)
     return torch.where(good & (votes > 1), votes, 0.0)

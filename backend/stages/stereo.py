@@ -70,7 +70,7 @@ def _points(views: tuple[View, ...], sizes: list[list[Measured]], config: Stereo
         normals=joined[1],
         colours_srgb=joined[2],
         confidence=joined[3],
-        num_views=joined[4].astype(np.int64),
+        num_views=np.ceil(joined[4]).astype(np.int64),
         view_index=joined[5].astype(np.int64),
     )
 
