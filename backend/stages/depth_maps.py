@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float, Shaped
 from torch import Tensor
 
 from ..maths.correlation import window_mean, window_sum
-from ..maths.geometry import inside, pixel_centres, project, sample_image, unproject
+from ..maths.geometry import Pinhole, inside, pixel_centres, project, sample_image, unproject
 from ..maths.inverse_depth import (
     distance_from_edges_px,
     fit_planes,
@@ -19,7 +19,15 @@ from ..maths.median import median_3x3
 from ..scene import Progress, within
 from .cross_check import cross_check
 from .patch_agreement import agreement
-from .plane_sweep import Map, better_of, inverse_depth_range, step_of_one_pixel, sweep, swept_again
+from .plane_sweep import (
+    Map,
+    better_of,
+    inverse_depth_range,
+    step_of_one_pixel,
+    subject_of,
+    sweep,
+    swept_again,
+)
 from .stereo_config import StereoConfig
 from .stereo_windows import Window, views_between
 
@@ -109,12 +117,13 @@ def _swept_again(
     progress: Progress,
 ) -> list[Map]:
     """All depths tried again where views agree on nothing."""
-    windows = [map_.window for map_ in maps]
+    subjects = [subject_of(map_.window) for map_ in maps]
     measured = [_votes(index, maps, nearby, config) > 0 for index in range(len(maps))]
     again = []
     for index, near in enumerate(sources):
         progress(index / len(maps), f"depth of photograph {index + 1}")
-        swept = swept_again(maps[index], measured[index], near, windows, config)
+        others = [one for i, one in enumerate(subjects) if one is not None and i != index]
+        swept = swept_again(maps[index], measured[index], near, others, config)
         again.append(_improved(swept, near, [0.5], config))
     return again
 
@@ -291,16 +300,22 @@ def _votes(
     }
     cameras = [map_.window.camera for map_ in maps]
     votes = torch.ones_like(own.inverse_depth)
+    past = {other: [k for k in views_between(cameras, index, other) if k in said] for other in said}
+    sees = {k: _in_sight(cameras[k], points) for k in set().union(*past.values())}
     for other, (agrees, _) in said.items():
         confirmed, denied, seen = (torch.zeros_like(agrees) for _ in range(3))
-        for between in views_between(cameras, index, other):
-            if between in said:
-                confirmed |= said[between][0]
-                denied |= said[between][1]
-                at, in_front = project(cameras[between], points)
-                seen |= inside(at, cameras[between].width, cameras[between].height) & (in_front > 0)
+        for between in past[other]:
+            confirmed |= said[between][0]
+            denied |= said[between][1]
+            seen |= sees[between]
         vote = torch.where(seen & ~confirmed, _UNCONFIRMED, 1.0)
         votes += vote * (agrees & (confirmed | ~denied))
     enough = (own.behind - _AS_GOOD).clamp(min=config.min_correlation)
     good = own.window.subject & (own.score > enough) & (points.norm(dim=-1) < 1.0)
     return torch.where(good & (votes > 1), votes, 0.0)
+
+
+def _in_sight(camera: Pinhole, points: Float[Tensor, "height width 3"]) -> Bool[Tensor, "height width"]:
+    """Whether points are seen within the picture, hidden or not."""
+    at, in_front = project(camera, points)
+    return inside(at, camera.width, camera.height) & (in_front > 0)

@@ -55,6 +55,19 @@ class Map:
     """How well patches agree behind the region, where that was better than anything in it; else 0."""
 
 
+Subject = tuple[Pinhole, Bool[Tensor, "_rows _columns"]]
+"""A photograph's camera, and the pixels on the subject or so near that cameras and masks may be wrong."""
+
+
+def subject_of(window: Window) -> Subject | None:
+    """None where nothing parts it from what is around it."""
+    if window.surrounded:
+        return None
+    side = 2 * _SURELY_OFF_PX + 1
+    near = F.max_pool2d(window.subject[None].float(), side, stride=1, padding=_SURELY_OFF_PX)[0] > 0
+    return window.camera, near
+
+
 def better_of(one: Map, other: Map) -> Map:
     """The other map, but the one's depths where patches agree clearly better."""
     kept = one.score > other.score + _AGREES_BETTER
@@ -71,7 +84,7 @@ def sweep(window: Window, sources: list[Window], config: StereoConfig) -> Map:
         nothing = torch.zeros_like(window.grey)
         return Map(window=window, inverse_depth=nothing, score=nothing, behind=nothing)
     near, far = inverse_depth_range(window.camera)
-    planes = _planes(window, sources, far, near, config.num_planes)
+    planes = _planes(window, sources, far, near, config)
     score = torch.cat(list(_tried(window, sources, planes)))
     cost = (1 - score).permute(1, 2, 0).contiguous()
     if config.semi_global:
@@ -96,12 +109,12 @@ def swept_again(
     current: Map,
     measured: Bool[Tensor, "height width"],
     sources: list[Window],
-    windows: list[Window],
+    subjects: list[Subject],
     config: StereoConfig,
 ) -> Map:
     """The best plane of what is textured but not `measured`, of all between which anything is.
 
-    Not where another photograph, of all the `windows`, shows that the subject is not there.
+    Not off the `subjects` that other photographs show.
     """
     window, sure = current.window, measured & (current.score > config.growth_correlation)
     asked = window.subject & ~sure & (current.behind == 0)
@@ -112,13 +125,12 @@ def swept_again(
         return current
     far, near = np.quantile(current.inverse_depth[sure].cpu().numpy(), [0.001, 0.999])
     pixels = torch.nonzero(asked.flatten())[:, 0]
-    around = [(w.camera, _near_subject(w)) for w in windows if w is not window and not w.surrounded]
     score, inverse_depth = current.score.flatten().clone(), current.inverse_depth.flatten().clone()
     best = (score[pixels] + _AGREES_BETTER).clamp(min=config.growth_correlation)
-    for some in torch.split(_planes(window, sources, far, near, config.num_planes), _AT_A_TIME):
+    for some in torch.split(_planes(window, sources, far, near, config), _AT_A_TIME):
         found = agreement(window, sources, _over(window, some), asked).flatten(1)[:, pixels]
         plane, pixel = torch.nonzero(found > best, as_tuple=True)
-        off = ~_may_be(window, around, pixels[pixel], some[plane])
+        off = ~_may_be(window, subjects, pixels[pixel], some[plane])
         found[plane[off], pixel[off]] = -1.0
         top, index = found.max(dim=0)
         better = top > best
@@ -154,12 +166,12 @@ def step_of_one_pixel(
 
 
 def _planes(
-    window: Window, sources: list[Window], far: float, near: float, most: int
+    window: Window, sources: list[Window], far: float, near: float, config: StereoConfig
 ) -> Float[Tensor, "planes"]:
     """Inverse depths from far to near, about a pixel apart in the source where matches move most."""
     middle = torch.full_like(window.grey, (near + far) / 2)
     step = min(float(step_of_one_pixel(window, [source], middle).median()) for source in sources)
-    count = int(np.clip(math.ceil((near - far) / step), 16, most)) + 1
+    count = int(np.clip(math.ceil((near - far) / step), 16, config.num_planes)) + 1
     return torch.linspace(far, near, count, device=window.grey.device)
 
 
@@ -177,22 +189,17 @@ def _tried(
 
 def _may_be(
     window: Window,
-    around: list[tuple[Pinhole, Bool[Tensor, "_rows _columns"]]],
+    subjects: list[Subject],
     pixels: Int64[Tensor, "pixels"],
     inverse_depth: Float[Tensor, "pixels"],
 ) -> Bool[Tensor, "pixels"]:
     """Whether places that pixels see are out of sight or at the subject in all other photographs."""
     everywhere = pixel_centres(window.camera.width, window.camera.height, window.grey.device)
     possible = torch.ones_like(pixels, dtype=torch.bool)
-    for camera, near in around:
+    for camera, near in subjects:
         a, b = epipolar_map(camera, window.camera)
         at = warp_pixels(a, b, everywhere.view(1, -1, 2)[:, pixels], inverse_depth[None, None])[0, 0]
         seen = inside(at, camera.width, camera.height)
         column, row = torch.where(seen[:, None], at, 0.0).long().unbind(dim=-1)
         possible &= near[row, column] | ~seen
     return possible
-
-
-def _near_subject(window: Window) -> Bool[Tensor, "height width"]:
-    side = 2 * _SURELY_OFF_PX + 1
-    return F.max_pool2d(window.subject[None].float(), side, stride=1, padding=_SURELY_OFF_PX)[0] > 0

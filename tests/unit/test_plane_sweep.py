@@ -11,7 +11,14 @@ from torch import Tensor
 from backend.maths.raycast import RayCaster, camera_rays
 from backend.scene import Camera, StereoResult, View, no_progress
 from backend.stages.patch_agreement import agreement
-from backend.stages.plane_sweep import Map, better_of, inverse_depth_range, step_of_one_pixel, swept_again
+from backend.stages.plane_sweep import (
+    Map,
+    better_of,
+    inverse_depth_range,
+    step_of_one_pixel,
+    subject_of,
+    swept_again,
+)
 from backend.stages.stereo import match_views
 from backend.stages.stereo_config import StereoConfig
 from backend.stages.stereo_windows import Window, pyramid
@@ -44,7 +51,7 @@ def truth() -> Tensor:
     return torch.tensor(OBJECT_UNIT / part, dtype=torch.float32)
 
 
-def half_right(behind: float = 0.0) -> tuple[Map, Tensor]:
+def half_right() -> tuple[Map, Tensor]:
     """Measured and true on the left of the middle; on the right at the far end, where nothing agrees."""
     window, known = windows()[1], torch.zeros_like(truth(), dtype=torch.bool)
     known[:, : known.shape[1] // 2] = True
@@ -54,13 +61,16 @@ def half_right(behind: float = 0.0) -> tuple[Map, Tensor]:
         window=window,
         inverse_depth=torch.where(known, truth(), far),
         score=torch.where(known, 0.9, 0.1),
-        behind=torch.full_like(truth(), behind),
+        behind=torch.zeros_like(truth()),
     )
     return one, known
 
 
 def again(one: Map, known: Tensor, others: list[Window]) -> Map:
-    return swept_again(one, known, [windows()[0], windows()[2]], others, CONFIG)
+    subjects = [
+        found for other in others if other.camera is not one.window.camera and (found := subject_of(other))
+    ]
+    return swept_again(one, known, [windows()[0], windows()[2]], subjects, CONFIG)
 
 
 def test_what_was_missed_is_found_and_what_was_measured_is_left() -> None:
@@ -127,7 +137,7 @@ def test_what_is_not_asked_stays_as_it_is(change) -> None:  # type: ignore[no-un
 
 def test_alone_a_view_stays_as_it_is() -> None:
     one, known = half_right()
-    assert swept_again(one, known, [], windows(), CONFIG) is one
+    assert swept_again(one, known, [], [], CONFIG) is one
 
 
 def test_the_better_of_two_keeps_what_agreed_clearly_better() -> None:
