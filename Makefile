@@ -15,7 +15,7 @@ help:
 	@echo "make extension   the zip to install in Blender"
 	@echo "make test-blender BLENDER=blender   the add-on's tests in a real Blender"
 	@echo "make screenshots BLENDER=blender    the pictures of the add-on in docs/images"
-	@echo "make benchmark SUITE=quick   speed against error: table and plot; also scenes, sides, photos; BUDGETS=\"10 20\"; RECORD=docs/results"
+	@echo "make benchmark SUITE=quick   speed against error: table and plot; also scenes, sides, parts, photos; BUDGETS=\"10 20\"; RECORD=docs/results"
 	@echo "make quick     the suite quick, and whether its numbers are within bounds"
 	@echo "make ablation CASES=\"monkey_3 plaster_6\"   what each part is worth; SEEDS=3 for medians"
 	@echo "make points    surfaces from points alone beside screened Poisson"

@@ -165,6 +165,16 @@ _SIDES = (
 """The first six with fine texture, the others painted."""
 _TURNS_DEG = (0, 60, 120, 180)
 
+_SIMULATED = "cloud_points2surf_abc"
+_PARTS = (
+    ("flange", f"{_SIMULATED}/00011084_gt.ply"),
+    ("clamp", f"{_SIMULATED}/00016513_gt.ply"),
+    ("plate", f"{_SIMULATED}/00994122_gt.ply"),
+)
+"""Parts of machines: flat faces, sharp edges, bores. No number of the program was chosen by them."""
+_PART_SURFACES = ((_FINE, "fine", 3), (_FINE, "fine", 6), (("--surface", "plain"), "plain", 6))
+"""Words, their name, and how many views."""
+
 _DTU, _TEMPLE, _WALNUT = "photos_dtu_scan118_3view", "photos_temple_sparse_ring", "photos_robovision_1"
 _FOUNTAIN, _BANANA, _BERLIN = "photos_fountain_p11", "photos_banana", "photos_berlin3"
 _OLD = "photos_kermit_et"
@@ -223,6 +233,14 @@ SUITES = MappingProxyType(
                     )
                     for name, scene, words in _SIDES
                     for turn_deg in _TURNS_DEG
+                ),
+            ),
+            Suite(
+                name="parts",
+                cases=tuple(
+                    rendered_case(mesh, count, name=f"{part}_{surface}", words=words)
+                    for part, mesh in _PARTS
+                    for words, surface, count in _PART_SURFACES
                 ),
             ),
             Suite(name="photos", cases=_PHOTO_CASES),

@@ -9,6 +9,7 @@ from backend.benchmark.measuring import Trial, reconstruct_words
 from backend.benchmark.suites import SUITES, Case, Suite, find_cases, image_paths, rendered_case
 
 CASES = [case for suite in SUITES.values() for case in suite.cases]
+DATA = Path(__file__).resolve().parents[2] / ".." / "shared" / "data"
 
 
 def filled(case: Case, folder: Path, num_images: int) -> Path:
@@ -37,6 +38,15 @@ def test_what_is_held_out_is_not_given(case: Case, tmp_path: Path) -> None:
 def test_cases_of_a_suite_have_names_of_their_own(name: str) -> None:
     names = [case.name for case in SUITES[name].cases]
     assert len(set(names)) == len(names)
+
+
+@pytest.mark.skipif(not DATA.is_dir(), reason="../shared/data is not there")
+@pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
+def test_no_case_is_left_out_for_a_wrong_name(case: Case) -> None:
+    if case.rendering is None:
+        assert (DATA / case.folder / case.images).is_dir()
+    elif Path(case.rendering.scene).suffix:
+        assert (DATA / case.rendering.scene).is_file()
 
 
 def test_an_image_cannot_be_both_given_and_held_out() -> None:
