@@ -172,8 +172,8 @@ _PARTS = (
     ("plate", f"{_SIMULATED}/00994122_gt.ply"),
 )
 """Parts of machines: flat faces, sharp edges, bores. No number of the program was chosen by them."""
-_PART_SURFACES = ((_FINE, "fine", 3), (_FINE, "fine", 6), (("--surface", "plain"), "plain", 6))
-"""Words, their name, and how many views."""
+_PART_SURFACES = (("fine", 3), ("fine", 6), ("plain", 6))
+"""And how many views."""
 
 _DTU, _TEMPLE, _WALNUT = "photos_dtu_scan118_3view", "photos_temple_sparse_ring", "photos_robovision_1"
 _FOUNTAIN, _BANANA, _BERLIN = "photos_fountain_p11", "photos_banana", "photos_berlin3"
@@ -238,9 +238,9 @@ SUITES = MappingProxyType(
             Suite(
                 name="parts",
                 cases=tuple(
-                    rendered_case(mesh, count, name=f"{part}_{surface}", words=words)
+                    rendered_case(mesh, count, name=f"{part}_{surface}", words=("--surface", surface))
                     for part, mesh in _PARTS
-                    for words, surface, count in _PART_SURFACES
+                    for surface, count in _PART_SURFACES
                 ),
             ),
             Suite(name="photos", cases=_PHOTO_CASES),
