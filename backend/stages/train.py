@@ -100,13 +100,15 @@ def fit_surface(
             so_far = _told_last(shown)
             linear, looks = _by_texture(config, level, scene, before, so_far, shares)
             tell = within(progress, done / total, (done + 10) / total)
-            ask = _asking(scene, config.linear, shown, looks, deadline, began_s, tell)
+            looks_s: list[float] = []
+            ask = _asking(scene, config.linear, shown, looks, deadline, began_s, looks_s, tell)
             distance = fit_level(
                 scene, before, radius, rounds, linear, far=far, told=so_far, ask=ask, looks=looks
             )
         done += 10
         show(Surface(distance=distance.cpu().numpy(), grid_from_world=frame.object_from_world))
-        costs.append(GridCost(nodes=nodes, seconds=clock() - began_s))
+        # looks take as long on any grid, and are left out where time is short
+        costs.append(GridCost(nodes=nodes, seconds=clock() - began_s - sum(looks_s)))
         if steps:
             tell = within(progress, done / total, (done + steps) / total)
             better = refine(scene, distance, steps, config.render, generator, tell, deadline)
@@ -159,10 +161,12 @@ def _asking(
     looks: int,
     deadline: Deadline,
     began_s: float,
+    looks_s: list[float],
     progress: Progress,
 ) -> Ask:
     """Asks brightness, `looks` times while there is time, and keeps what it answers in `shown`.
 
+    How long each look took is kept in `looks_s`.
     Once if that weighs little: beside texture it does not, and each look takes as long as a round of the fit.
     """
     before = len(shown)
@@ -171,10 +175,12 @@ def _asking(
         if len(shown) > before and weight_beside(shown[-1], scene, config) < _LITTLE:
             return None
         # a look and a round take less than the fit did until here
-        if deadline.left_s() < deadline.clock() - began_s:
+        asked_s = deadline.clock()
+        if deadline.left_s() < asked_s - began_s:
             return None
         progress((len(shown) - before) / looks, "looking where photographs are equally bright")
         shown.append(shared_brightness(scene, distance, may_shine=config.may_shine))
+        looks_s.append(deadline.clock() - asked_s)
         return _told_last(shown)
 
     return ask

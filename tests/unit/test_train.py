@@ -315,6 +315,19 @@ def limited(budget_s: float | None, steps: int = 20, tick_s: float = 1.0) -> Sur
         torch.use_deterministic_algorithms(False)
 
 
+def two_places(weights: torch.Tensor) -> ShownPlaces:
+    """On the subject's surface, as if brightness had told them."""
+    some = torch.tensor([[0.0, 0.0, 0.5], [0.0, 0.5, 0.0]])
+    return ShownPlaces(
+        positions=some,
+        normals=2 * some,
+        weights=weights,
+        mirrored=torch.zeros(2),
+        directions=-2 * some,
+        hidden=torch.zeros(2, dtype=torch.bool),
+    )
+
+
 def decision_on(surface: Surface, what: str) -> Decision:
     (found,) = (decision for decision in surface.decisions if decision.what == what)
     return found
@@ -352,6 +365,39 @@ def test_time_enough_changes_nothing_but_the_words() -> None:
     assert decision_on(ample, "budget").choice == "all that the preset asks for"
 
 
+def test_long_looks_are_not_taken_for_the_cost_of_a_grid(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two looks of 100 s leave 150 of 350 s: enough for a grid of a few seconds."""
+    now_s = [0.0]
+
+    def clock() -> float:
+        now_s[0] += 1.0
+        return now_s[0]
+
+    def long_look(*field: Any, **how: Any) -> ShownPlaces:
+        now_s[0] += 100.0
+        return two_places(torch.ones(2))
+
+    monkeypatch.setattr(train, "textured", lambda scene, distance: 0.35)
+    monkeypatch.setattr(train, "weight_beside", lambda *asked: 1.0)
+    monkeypatch.setattr(train, "shared_brightness", long_look)
+    config = TrainConfig(
+        levels=(32, 56, 64), rounds=(2, 2, 2), steps=(0, 0, 0), looks=(0, 2, 0), budget_s=350.0
+    )
+    config = replace(config, linear=LinearConfig(settled=0.0))
+    surface = fit_surface(
+        masked_scene().views,
+        true_region(),
+        masked_stereo(),
+        config,
+        device=torch.device("cpu"),
+        generator=torch.Generator().manual_seed(0),
+        progress=no_progress,
+        clock=clock,
+    )
+    assert now_s[0] > 200
+    assert len(surface.distance) == 64
+
+
 def test_the_report_says_why_brightness_was_left_out() -> None:
     whole, stopped = (
         decision_on(limited(budget_s, steps=0), "brightness without texture") for budget_s in (None, 0.5)
@@ -364,15 +410,7 @@ def test_the_report_says_why_brightness_was_left_out() -> None:
 def test_the_last_grid_of_a_plain_subject_is_fitted_as_such(monkeypatch: pytest.MonkeyPatch) -> None:
     """From the grid before it hears what brightness told there, and how much of the surface is textured."""
     heard: list[tuple[int, float, int]] = []
-    some = torch.tensor([[0.0, 0.0, 0.5], [0.0, 0.5, 0.0]])
-    places = ShownPlaces(
-        positions=some,
-        normals=2 * some,
-        weights=torch.ones(2),
-        mirrored=torch.zeros(2),
-        directions=-2 * some,
-        hidden=torch.zeros(2, dtype=torch.bool),
-    )
+    places = two_places(torch.ones(2))
 
     def spy(scene: Measurements, before: torch.Tensor, *args: Any, **words: Any) -> torch.Tensor:
         told = words.get("told")
@@ -398,21 +436,14 @@ def test_the_last_grid_of_a_plain_subject_is_fitted_as_such(monkeypatch: pytest.
 
 def test_what_hardly_weighs_is_asked_about_once_on_each_grid(monkeypatch: pytest.MonkeyPatch) -> None:
     """Stereo's points weigh the cube of their confidence."""
-    some, asked = torch.tensor([[0.0, 0.0, 0.5], [0.0, 0.5, 0.0]]), [0]
+    asked = [0]
     views, region, stereo = masked_scene(), true_region(), masked_stereo()
     measured = float((torch.tensor(stereo.points.confidence) ** 3).sum())
     monkeypatch.setattr(train, "textured", lambda scene, distance: 0.35)
     config = TrainConfig(levels=(16, 24, 32), rounds=(3, 5, 5), steps=(0, 0, 0), looks=(0, 3, 2))
     config = replace(config, linear=LinearConfig(settled=0.0))
     for share, looks in ((0.05, 1 + 1), (0.2, 3 + 2)):
-        told = ShownPlaces(
-            positions=some,
-            normals=2 * some,
-            weights=torch.full((2,), share * measured / 2),
-            mirrored=torch.zeros(2),
-            directions=-2 * some,
-            hidden=torch.zeros(2, dtype=torch.bool),
-        )
+        told = two_places(torch.full((2,), share * measured / 2))
 
         def counted(*field: Any, told: ShownPlaces = told, **how: Any) -> ShownPlaces:
             asked[0] += 1
