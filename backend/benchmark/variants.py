@@ -52,8 +52,15 @@ VARIANTS = (
     Variant(name="small pieces kept", changes={"stereo.min_piece_px": 0}),
     Variant(name="sharpness ignored", changes={"stereo.full_sharpness": _NEXT_TO_NOTHING}),
     Variant(name="edges ignored", changes={"stereo.edge_doubt": _NEXT_TO_NOTHING}),
-    Variant(name="confidence itself", changes={"train.linear.confidence_power": 1.0}),
-    Variant(name="all points alike", changes={"train.linear.confidence_power": 0.0}),
+    Variant(
+        name="confidence itself",
+        changes={"train.linear.confidence_power": 1.0, "train.linear.power_if_textured": 1.0},
+    ),
+    Variant(
+        name="all points alike",
+        changes={"train.linear.confidence_power": 0.0, "train.linear.power_if_textured": 0.0},
+    ),
+    Variant(name="textured as plain", changes={"train.linear.power_if_textured": 3.0}),
     Variant(name="sums instead of means", changes={"train.linear.correlated": False}),
     Variant(name="points speak 0.7 cells far", changes={"train.linear.spread_cells": 0.7}),
     Variant(name="points speak 1.4 cells far", changes={"train.linear.spread_cells": 1.4}),

@@ -67,6 +67,8 @@ class LinearConfig:
     """Of what stereo measured, beside what brightness tells."""
     confidence_power: float = 3.0
     """Points weigh as this power of their confidence."""
+    power_if_textured: float = 1.5
+    """The same where patches agree on most of the surface."""
     correlated: bool = True
     """Neighbouring pixels are matched by nearly the same windows: their errors are one error."""
     ball: float | None = None
@@ -88,6 +90,11 @@ def for_plain(config: LinearConfig, textured: float, told: float) -> LinearConfi
         smoothness=(1 + plain) * config.smoothness,
         rims=(1 + 2 * plain) * config.rims,
     )
+
+
+def for_textured(config: LinearConfig) -> LinearConfig:
+    """Where patches agree on most of the surface: there doubtful points are seldom wrong, and count more."""
+    return replace(config, confidence_power=config.power_if_textured)
 
 
 def weight_beside(told: ShownPlaces, scene: Measurements, config: LinearConfig) -> float:

@@ -38,7 +38,8 @@ class StereoConfig:
     trust_of_half_size: float = 0.63
     """Share of its confidence that is left to what only photographs of half the size show.
 
-    The fit weighs points by the cube of their confidence: a quarter, as a pixel there stands for four.
+    Where little is textured the fit weighs points by the cube of it: a quarter, as a pixel there stands
+    for four.
     """
     max_points: int = 500_000
     """Points kept, evenly over all that are measured; depth maps keep every pixel."""

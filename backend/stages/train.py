@@ -17,7 +17,7 @@ from ..maths.grid import refined, spacing
 from ..scene import Decision, Progress, Region, StereoResult, View, within
 from .deadline import Clock, Deadline, GridCost, deadline_after, finest_grid, predicted_s
 from .inner_outlines import FarSide, decision, far_sides
-from .linear_fit import Ask, LinearConfig, fit_level, for_plain, start, weight_beside
+from .linear_fit import Ask, LinearConfig, fit_level, for_plain, for_textured, start, weight_beside
 from .measurements import Measurements, carried, measurements
 from .render_fit import RenderConfig, refine
 from .safe_steps import not_finite
@@ -148,10 +148,12 @@ def _by_texture(
     if not config.linear.brightness or not looks:
         return config.linear, 0
     shares.append(textured(scene, before))
+    if shares[-1] > MOSTLY_TEXTURED:
+        return for_textured(config.linear), 0
     linear = config.linear
     if told is not None and is_last:
         linear = for_plain(linear, shares[-1], share_told(told, before))
-    return linear, looks if shares[-1] <= MOSTLY_TEXTURED else 0
+    return linear, looks
 
 
 def _asking(

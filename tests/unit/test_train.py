@@ -434,6 +434,32 @@ def test_the_last_grid_of_a_plain_subject_is_fitted_as_such(monkeypatch: pytest.
         assert heard[-4:] == [(16, 1.0, 0), (20, 1.0, 0), (24, 1.0, num), (32, stereo, num)]
 
 
+def test_doubtful_points_count_more_where_most_is_textured(monkeypatch: pytest.MonkeyPatch) -> None:
+    """From the first grid on whose texture is looked at; brightness is not asked there."""
+    powers: list[float] = []
+
+    def spy(scene: Measurements, before: torch.Tensor, *args: Any, **words: Any) -> torch.Tensor:
+        powers.append(args[2].confidence_power)
+        return fit_level(scene, before, *args, **words)
+
+    def nobody(*field: Any, **how: Any) -> ShownPlaces:
+        raise AssertionError("brightness was asked")
+
+    monkeypatch.setattr(train, "fit_level", spy)
+    config = TrainConfig(levels=(16, 24, 32), rounds=(3, 3, 3), steps=(0, 0, 0), looks=(0, 2, 2))
+    usual = LinearConfig()
+    assert usual.power_if_textured < usual.confidence_power
+    for share, asked, last in (
+        (0.86, nobody, [usual.confidence_power, usual.power_if_textured, usual.power_if_textured]),
+        (0.35, lambda *field, **how: two_places(torch.ones(2)), [usual.confidence_power] * 3),
+    ):
+        monkeypatch.setattr(train, "textured", lambda scene, distance, share=share: share)
+        monkeypatch.setattr(train, "shared_brightness", asked)
+        powers.clear()
+        fitted(masked_scene(), true_region(), masked_stereo(), config)
+        assert powers[-3:] == last
+
+
 def test_what_hardly_weighs_is_asked_about_once_on_each_grid(monkeypatch: pytest.MonkeyPatch) -> None:
     """Stereo's points weigh the cube of their confidence."""
     asked = [0]
