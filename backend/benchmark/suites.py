@@ -171,7 +171,7 @@ _PARTS = (
     ("clamp", f"{_SIMULATED}/00016513_gt.ply"),
     ("plate", f"{_SIMULATED}/00994122_gt.ply"),
 )
-"""Parts of machines: flat faces, sharp edges, bores. No number of the program was chosen by them."""
+"""Parts of machines: flat faces, sharp edges, bores. No number was chosen by them before 2026-11-27."""
 _PART_SURFACES = (("fine", 3), ("fine", 6), ("plain", 6))
 """And how many views."""
 

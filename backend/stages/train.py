@@ -145,7 +145,7 @@ def _by_texture(
     first, between, last = config.looks
     is_last = level == len(config.levels) - 1
     looks = last if is_last else between if level else first
-    if not config.linear.brightness or not looks:
+    if not looks:
         return config.linear, 0
     shares.append(textured(scene, before))
     if shares[-1] > MOSTLY_TEXTURED:
@@ -153,7 +153,7 @@ def _by_texture(
     linear = config.linear
     if told is not None and is_last:
         linear = for_plain(linear, shares[-1], share_told(told, before))
-    return linear, looks
+    return linear, looks if config.linear.brightness else 0
 
 
 def _asking(

@@ -4,6 +4,7 @@ Grids and photographs are small, so errors are a share of the grid's cells; benc
 gets on photographs of full size.
 """
 
+import time
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache, partial
@@ -66,6 +67,7 @@ def fitted(
     seed: int = 0,
     progress: Progress = no_progress,
     show: ShowSurface = show_nothing,
+    clock: Callable[[], float] = time.perf_counter,
 ) -> Surface:
     return fit_surface(
         scene.views,
@@ -76,6 +78,7 @@ def fitted(
         generator=torch.Generator().manual_seed(seed),
         progress=progress,
         show=show,
+        clock=clock,
     )
 
 
@@ -301,16 +304,7 @@ def limited(budget_s: float | None, steps: int = 20, tick_s: float = 1.0) -> Sur
     config = TrainConfig(levels=(16, 24, 32), rounds=(5, 5, 5), steps=(0, 0, steps), budget_s=budget_s)
     torch.use_deterministic_algorithms(True)
     try:
-        return fit_surface(
-            masked_scene().views,
-            true_region(),
-            masked_stereo(),
-            config,
-            device=torch.device("cpu"),
-            generator=torch.Generator().manual_seed(0),
-            progress=no_progress,
-            clock=ticking(tick_s),
-        )
+        return fitted(masked_scene(), true_region(), masked_stereo(), config, clock=ticking(tick_s))
     finally:
         torch.use_deterministic_algorithms(False)
 
@@ -384,16 +378,7 @@ def test_long_looks_are_not_taken_for_the_cost_of_a_grid(monkeypatch: pytest.Mon
         levels=(32, 56, 64), rounds=(2, 2, 2), steps=(0, 0, 0), looks=(0, 2, 0), budget_s=350.0
     )
     config = replace(config, linear=LinearConfig(settled=0.0))
-    surface = fit_surface(
-        masked_scene().views,
-        true_region(),
-        masked_stereo(),
-        config,
-        device=torch.device("cpu"),
-        generator=torch.Generator().manual_seed(0),
-        progress=no_progress,
-        clock=clock,
-    )
+    surface = fitted(masked_scene(), true_region(), masked_stereo(), config, clock=clock)
     assert now_s[0] > 200
     assert len(surface.distance) == 64
 
@@ -449,14 +434,17 @@ def test_doubtful_points_count_more_where_most_is_textured(monkeypatch: pytest.M
     config = TrainConfig(levels=(16, 24, 32), rounds=(3, 3, 3), steps=(0, 0, 0), looks=(0, 2, 2))
     usual = LinearConfig()
     assert usual.power_if_textured < usual.confidence_power
-    for share, asked, last in (
-        (0.86, nobody, [usual.confidence_power, usual.power_if_textured, usual.power_if_textured]),
-        (0.35, lambda *field, **how: two_places(torch.ones(2)), [usual.confidence_power] * 3),
+    unasked = replace(usual, brightness=0.0)
+    textured = [usual.confidence_power, usual.power_if_textured, usual.power_if_textured]
+    for share, linear, asked, last in (
+        (0.86, usual, nobody, textured),
+        (0.86, unasked, nobody, textured),
+        (0.35, usual, lambda *field, **how: two_places(torch.ones(2)), [usual.confidence_power] * 3),
     ):
         monkeypatch.setattr(train, "textured", lambda scene, distance, share=share: share)
         monkeypatch.setattr(train, "shared_brightness", asked)
         powers.clear()
-        fitted(masked_scene(), true_region(), masked_stereo(), config)
+        fitted(masked_scene(), true_region(), masked_stereo(), replace(config, linear=linear))
         assert powers[-3:] == last
 
 
