@@ -1,7 +1,8 @@
 """How a result's colours, its support and its error are shown in the viewport and in renders.
 
 A mesh has one colour attribute per way of showing it. Solid mode and the material both follow the active
-one: the material's node has no layer name, which means the attribute that is marked for rendering.
+one: the material's node has no layer name, which means the attribute that is marked for rendering. A texture
+takes the place of the mesh's own colours, which are as fine as its vertices, for as long as it has a UV map.
 """
 
 from typing import Literal
@@ -16,6 +17,9 @@ COLOUR = "Color"
 Kind = Literal["COLOUR", "SUPPORT", "ERROR"]
 """What a mesh can show."""
 _HEAT_MAPS: dict[Kind, HeatMap] = {"SUPPORT": SUPPORT, "ERROR": ERROR}
+UV_MAP = "FewView"
+"""Name of the UV map of a result's texture."""
+_ATTRIBUTE_NODE, _TEXTURE_NODE = "FewView Colors", "FewView Texture"
 _MISSING: dict[Kind, str] = {
     "COLOUR": "This mesh has no colors: import the result again",
     "SUPPORT": "This mesh does not know its support: import the result again",
@@ -23,8 +27,10 @@ _MISSING: dict[Kind, str] = {
 }
 
 
-def make_material(name: str, mean_linear: tuple[float, float, float]) -> bpy.types.Material:
-    """A rough material without highlights that shows the mesh's colour attribute marked for rendering."""
+def make_material(
+    name: str, mean_linear: tuple[float, float, float], texture: bpy.types.Image | None
+) -> bpy.types.Material:
+    """A rough material without highlights that shows what `show` says."""
     material = bpy.data.materials.new(name)
     if material.node_tree is None:  # from 5.0 on there is one from the start
         material.use_nodes = True
@@ -33,12 +39,20 @@ def make_material(name: str, mean_linear: tuple[float, float, float]) -> bpy.typ
     output = nodes.new("ShaderNodeOutputMaterial")
     surface = nodes.new("ShaderNodeBsdfPrincipled")
     colours = nodes.new("ShaderNodeVertexColor")
-    colours.layer_name = ""
+    colours.layer_name, colours.name = "", _ATTRIBUTE_NODE
     surface.inputs["Roughness"].default_value = 1.0
     surface.inputs["Specular IOR Level"].default_value = 0.0
     links.new(colours.outputs["Color"], surface.inputs["Base Color"])
     links.new(surface.outputs["BSDF"], output.inputs["Surface"])
     surface.location, output.location, colours.location = (0, 0), (300, 0), (-220, 0)
+    if texture is not None:
+        picture = nodes.new("ShaderNodeTexImage")
+        picture.image, picture.name, picture.extension = texture, _TEXTURE_NODE, "EXTEND"
+        where = nodes.new("ShaderNodeUVMap")
+        where.uv_map = UV_MAP
+        links.new(where.outputs["UV"], picture.inputs["Vector"])
+        picture.location, where.location = (-300, 200), (-500, 200)
+        nodes.active = picture  # what solid mode draws
     material.diffuse_color = (*mean_linear, 1.0)
     material.roughness, material.specular_intensity = 1.0, 0.0
     return material
@@ -77,15 +91,52 @@ def show(mesh: bpy.types.Mesh, kind: Kind) -> None:
     index = mesh.color_attributes.find(name)
     mesh.color_attributes.active_color_index = index
     mesh.color_attributes.render_color_index = index
+    _choose_node(mesh)
     mesh.update_tag()
 
 
-def show_in_viewports() -> None:
-    """Have solid mode show colour attributes, in 3D viewports that show materials' colours."""
+def shows_texture(mesh: bpy.types.Mesh) -> bool:
+    """Whether what the mesh shows is a texture."""
+    return shown(mesh) == "COLOUR" and texture_or_none(mesh) is not None
+
+
+def texture_or_none(mesh: bpy.types.Mesh) -> bpy.types.Image | None:
+    """The picture of a mesh with a UV map for it."""
+    if UV_MAP not in mesh.uv_layers:
+        return None
+    found = (nodes[_TEXTURE_NODE].image for nodes in map(_nodes_or_none, mesh.materials) if nodes is not None)
+    return next((image for image in found if image is not None), None)
+
+
+def show_in_viewports(mesh: bpy.types.Mesh) -> None:
+    """Have solid mode show what the mesh shows, in 3D viewports that do not show something of their own."""
+    wanted = "TEXTURE" if shows_texture(mesh) else "VERTEX"
     for window in bpy.context.window_manager.windows:
         for area in window.screen.areas:
-            if area.type == "VIEW_3D" and area.spaces.active.shading.color_type == "MATERIAL":
-                area.spaces.active.shading.color_type = "VERTEX"
+            if area.type == "VIEW_3D":
+                shading = area.spaces.active.shading
+                if shading.color_type in ("MATERIAL", "VERTEX", "TEXTURE"):
+                    shading.color_type = wanted
+
+
+def _choose_node(mesh: bpy.types.Mesh) -> None:
+    """Connect the texture, or the colour attribute, in materials that still have both as they were made."""
+    name = _TEXTURE_NODE if shows_texture(mesh) else _ATTRIBUTE_NODE
+    for material in mesh.materials:
+        nodes = _nodes_or_none(material)
+        if nodes is None:
+            continue
+        for link in list(material.node_tree.links):
+            if link.from_node.name in (_ATTRIBUTE_NODE, _TEXTURE_NODE) and link.from_node.name != name:
+                material.node_tree.links.new(nodes[name].outputs["Color"], link.to_socket)
+
+
+def _nodes_or_none(material: bpy.types.Material | None) -> bpy.types.Nodes | None:
+    """The nodes of a material that can show a texture or an attribute."""
+    if material is None or material.node_tree is None:
+        return None
+    nodes = material.node_tree.nodes
+    return nodes if _ATTRIBUTE_NODE in nodes and _TEXTURE_NODE in nodes else None
 
 
 def _draw(mesh: bpy.types.Mesh, heat: HeatMap) -> str:

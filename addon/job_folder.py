@@ -19,8 +19,9 @@ from pathlib import Path
 from ..backend.wire.protocol import Job, ProtocolError, decode_job, encode_job
 
 JOB_FILE, LOG, RESULT, CLOUD = "job.json", "backend.log", "result", "cloud.ply"
-MESH, RADIANCE, CAMERAS, CAMERAS_PAGE, REPORT_PAGE, REPORT_NUMBERS, SPARSE = (
+MESH, TEXTURE, RADIANCE, CAMERAS, CAMERAS_PAGE, REPORT_PAGE, REPORT_NUMBERS, SPARSE = (
     "mesh.ply",
+    "texture.png",
     "radiance.npz",
     "cameras.json",
     "cameras.html",

@@ -35,6 +35,8 @@ class MeshArrays:
     """Mean colour in linear light; grey where there are no colours."""
     support: NDArray[np.float32] | None
     """(vertices,)."""
+    corner_coordinates: NDArray[np.float32] | None
+    """(3 faces, 2): the UV map; None where there is no texture."""
 
     @property
     def num_faces(self) -> int:
@@ -51,7 +53,8 @@ def mesh_arrays(mesh: PlyMesh, world_from_solved: NDArray[np.float64]) -> MeshAr
     positions = mesh.positions @ world_from_solved[:3, :3].T + world_from_solved[:3, 3]
     if positions.size and not np.abs(positions).max() <= _LARGEST_COORDINATE:  # also for NaN
         raise ValueError("the mesh lies too far away or is too large for Blender")
-    faces = proper_faces(mesh.faces)
+    proper = are_proper(mesh.faces)
+    faces = mesh.faces[proper]
     edges, corner_edges = edges_of(faces, len(positions))
     colours = None if mesh.colours_srgb is None else mesh.colours_srgb.astype(np.float32) / np.float32(255)
     return MeshArrays(
@@ -63,16 +66,17 @@ def mesh_arrays(mesh: PlyMesh, world_from_solved: NDArray[np.float64]) -> MeshAr
         colours_srgb=colours,
         mean_linear=_mean_linear(mesh.colours_srgb),
         support=mesh.support,
+        corner_coordinates=None if mesh.coordinates is None else mesh.coordinates[proper].reshape(-1, 2),
     )
 
 
-def proper_faces(faces: NDArray[np.int32]) -> NDArray[np.int32]:
-    """(faces, 3): those of three different vertices, each triple once, in the order they came in."""
+def are_proper(faces: NDArray[np.int32]) -> NDArray[np.bool_]:
+    """(faces,): whether each is of three different vertices, and the first of its triple."""
     a, b, c = np.sort(faces, axis=1).T
     order = np.lexsort((c, b, a))
     same = np.zeros(len(faces), bool)
     same[order[1:]] = (np.diff(a[order]) == 0) & (np.diff(b[order]) == 0) & (np.diff(c[order]) == 0)
-    return faces[(a != b) & (b != c) & ~same]
+    return (a != b) & (b != c) & ~same
 
 
 def edges_of(faces: NDArray[np.int32], num_vertices: int) -> tuple[NDArray[np.int32], NDArray[np.int32]]:

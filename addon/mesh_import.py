@@ -46,6 +46,8 @@ class MeshImport:
     """(4, 4) similarity; baked into the vertices."""
     name: str = ""
     """Of the result; that of the job's folder where this is empty."""
+    texture: Path | None = None
+    """The picture that the mesh's coordinates are for; it becomes a part of the .blend file."""
     parent_uid: int | None = None
     """`session_uid` of the object that the result shall follow when it is moved."""
 
@@ -79,7 +81,7 @@ def show_preview(path: Path, wanted: MeshImport) -> Stepwise[None]:
     mesh = _mesh_or_none(uid)
     assert mesh is not None
     if arrays.colours_srgb is not None:
-        colours.show_in_viewports()
+        colours.show_in_viewports(mesh)
     scene = scene_named(wanted.scene_name)
     preview = next((made for made in scene.objects if made.get(ROLE) == PREVIEW), None)
     if preview is None:
@@ -182,6 +184,9 @@ def _add_attributes(mesh: bpy.types.Mesh, arrays: MeshArrays) -> None:
         # The bytes of the file are sRGB and stay what they are; `color` would take linear light.
         _fill(mesh, colours.COLOUR, "color_srgb", arrays.colours_srgb)
         colours.show(mesh, "COLOUR")
+    if arrays.corner_coordinates is not None:
+        mesh.uv_layers.new(name=colours.UV_MAP, do_init=False)
+        _fill(mesh, colours.UV_MAP, "vector", arrays.corner_coordinates)
 
 
 _WORKS = (_add_vertices, _add_corners, _fill_topology, _add_faces, _add_attributes)
@@ -194,14 +199,26 @@ def _fill(mesh: bpy.types.Mesh, attribute: str, field: str, values: NDArray[Any]
         mesh.attributes[attribute].data.foreach_set(field, np.ascontiguousarray(values).ravel())
 
 
+def _texture_or_none(path: Path | None) -> bpy.types.Image | None:
+    """The picture, packed: the job's folder may be removed. Without it the vertices' colours are shown."""
+    if path is None or not path.is_file():
+        return None
+    image = bpy.data.images.load(str(path))
+    image.name = "FewView Texture"
+    image.pack()
+    return image
+
+
 def _show_result(uid: int, arrays: MeshArrays, wanted: MeshImport) -> None:
     """The finished mesh as an object of the scene."""
     mesh = _mesh_or_none(uid)
     assert mesh is not None
     scene = scene_named(wanted.scene_name)
     if arrays.colours_srgb is not None:
-        mesh.materials.append(colours.make_material("FewView Colors", arrays.mean_linear))
-        colours.show_in_viewports()
+        texture = None if arrays.corner_coordinates is None else _texture_or_none(wanted.texture)
+        mesh.materials.append(colours.make_material("FewView Colors", arrays.mean_linear, texture))
+        colours.show(mesh, "COLOUR")
+        colours.show_in_viewports(mesh)
     remove_preview()
     made = bpy.data.objects.new(mesh.name, mesh)
     made[JOB], made[ROLE] = wanted.job, MESH

@@ -1,7 +1,8 @@
 """Reads the PLY files that the backend writes, and writes points for it; numpy and the standard library, no
 Blender needed.
 
-    mesh.ply preview.ply     positions, normals, 8-bit sRGB colours, `support`, triangles
+    mesh.ply preview.ply     positions, normals, 8-bit sRGB colours, `support`, triangles with or without
+                             coordinates in a texture
     points.ply sparse.ply    the same without triangles, with `confidence` or nothing in place of `support`
 
 Nothing in a file is believed before it is checked: the header first, against the size of the file, so
@@ -30,6 +31,7 @@ _NUMBERS = {
     **dict.fromkeys(("uint", "uint32"), "<u4"),
 }
 _CORNERS = re.compile(r"property list (?:uchar|uint8) (int|int32|uint|uint32) vertex_ind(?:ices|ex)")
+_COORDINATES = re.compile(r"property list (?:uchar|uint8) (?:float|float32) texcoord")
 _POSITION, _NORMAL = ("x", "y", "z"), ("nx", "ny", "nz")
 _COLOUR = ("red", "green", "blue")
 _SUPPORT = ("support", "confidence")
@@ -49,6 +51,8 @@ class PlyMesh:
     """(vertices, 4): red, green, blue, alpha."""
     support: NDArray[np.float32] | None
     """(vertices,), finite: `support` or `confidence`."""
+    coordinates: NDArray[np.float32] | None
+    """(faces, 3, 2), finite: where in its texture each face's corners lie, u to the right and v up."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -169,11 +173,15 @@ def _check_types(record: np.dtype[np.void], fields: tuple[str, ...], kind: str, 
 
 
 def _face_record(properties: list[str], name: str) -> np.dtype[np.void]:
-    """Of a triangle, with the number of its corners."""
-    found = _CORNERS.fullmatch(properties[0]) if len(properties) == 1 else None
-    if found is None:
+    """Of a triangle, with the number of its corners, and of their coordinates where it has any."""
+    patterns = (_CORNERS, _COORDINATES)[: max(1, len(properties))]
+    found = [pattern.fullmatch(line) for pattern, line in zip(patterns, properties, strict=False)]
+    if len(properties) not in (1, 2) or found[0] is None or None in found:
         raise ValueError(f"{name} has faces with other properties than their corners")
-    return np.dtype([("num_corners", "u1"), ("corners", _NUMBERS[found[1]], (3,))])
+    fields: list[Any] = [("num_corners", "u1"), ("corners", _NUMBERS[found[0][1]], (3,))]
+    if len(properties) == 2:
+        fields += [("num_coordinates", "u1"), ("coordinates", "<f4", (3, 2))]
+    return np.dtype(fields)
 
 
 def _mesh(body: bytes, layout: _Layout, name: str) -> PlyMesh:
@@ -190,15 +198,18 @@ def _mesh(body: bytes, layout: _Layout, name: str) -> PlyMesh:
         (_columns(vertices, (f,), np.float32) for f in _SUPPORT if f in (vertices.dtype.names or ())), None
     )
     assert positions is not None
-    for what, values in (("positions", positions), ("normals", normals), ("support", support)):
+    faces, coordinates = _faces(body, layout, name)
+    checked = {"positions": positions, "normals": normals, "support": support, "coordinates": coordinates}
+    for what, values in checked.items():
         if values is not None and not np.isfinite(values).all():
             raise ValueError(f"{name} has {what} that are not finite numbers")
     return PlyMesh(
         positions=positions,
-        faces=_faces(body, layout, name),
+        faces=faces,
         normals=normals,
         colours_srgb=colours,
         support=None if support is None else support[:, 0],
+        coordinates=coordinates,
     )
 
 
@@ -215,13 +226,18 @@ def _columns(
     return columns
 
 
-def _faces(body: bytes, layout: _Layout, name: str) -> NDArray[np.int32]:
+def _faces(body: bytes, layout: _Layout, name: str) -> tuple[NDArray[np.int32], NDArray[np.float32] | None]:
+    """Corners of the triangles, and their coordinates where there are any."""
     if layout.face is None:
-        return np.zeros((0, 3), np.int32)
+        return np.zeros((0, 3), np.int32), None
     records = np.frombuffer(body, layout.face, layout.num_faces, layout.num_vertices * layout.vertex.itemsize)
     if (records["num_corners"] != 3).any():
         raise ValueError(f"{name} has faces that are no triangles")
     corners = records["corners"]
     if corners.size and (corners.min() < 0 or corners.max() >= layout.num_vertices):
         raise ValueError(f"{name} has faces with corners that do not exist")
-    return corners.astype(np.int32)
+    if "coordinates" not in (layout.face.names or ()):
+        return corners.astype(np.int32), None
+    if (records["num_coordinates"] != 6).any():
+        raise ValueError(f"{name} has faces with other coordinates than two for each corner")
+    return corners.astype(np.int32), records["coordinates"].astype(np.float32)

@@ -19,7 +19,7 @@ from .camera_objects import (
     upright,
 )
 from .frames import finds_cameras, frame_owner, world_from_solved_or_none
-from .job_folder import CAMERAS, MESH, PastJob, inside, read_job, results_in
+from .job_folder import CAMERAS, MESH, TEXTURE, PastJob, inside, read_job, results_in
 from .mesh_import import MeshImport, import_mesh, read_in_steps
 from .scenes import scene_named
 from .solved import SolvedScene, read_solved
@@ -58,6 +58,7 @@ def import_result_steps(
     wanted = MeshImport(
         job=str(job.folder.absolute()),
         scene_name=scene_name,
+        texture=inside(job.folder, job.result / TEXTURE),
         world_from_solved=world_from_solved(scene, job, None if found is None else found.solved),
         parent_uid=None if root is None else root.session_uid,
     )

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 
 import bpy
@@ -51,7 +52,7 @@ def usual_voxel(result: bpy.types.Object) -> float:
 
 
 def remesh(context: bpy.types.Context, result: bpy.types.Object, voxel: float) -> None:
-    """Even triangles of a closed surface in place of the mesh's own; colours and support stay.
+    """Even triangles of a closed surface in place of the mesh's own; support and the vertices' colours stay.
 
     Raises ValueError where the voxels, in the object's units, would be too many or none.
     """
@@ -67,6 +68,9 @@ def remesh(context: bpy.types.Context, result: bpy.types.Object, voxel: float) -
     with context.temp_override(object=result, active_object=result, selected_objects=[result]):
         bpy.ops.object.voxel_remesh()
     result.data.shade_smooth()
+    if colours.UV_MAP in result.data.uv_layers:
+        # Blender carries it over; where charts met, new triangles would span all that lies between them.
+        result.data.uv_layers.remove(result.data.uv_layers[colours.UV_MAP])
     if kind and colours.can_show(result.data, kind):
         colours.show(result.data, kind)
 
@@ -76,14 +80,13 @@ def export(context: bpy.types.Context, result: bpy.types.Object, path: Path) -> 
 
     Raises ValueError, in a sentence for the user, for other formats and where Blender cannot write it.
     """
+    texture = colours.texture_or_none(result.data) if colours.shows_texture(result.data) else None
     writers: dict[str, Callable[[str], object]] = {
-        ".glb": _write_glb,
+        ".glb": partial(_write_glb, textured=texture is not None),
         ".ply": lambda name: bpy.ops.wm.ply_export(
             filepath=name, export_selected_objects=True, export_colors="SRGB", export_attributes=True
         ),
-        ".obj": lambda name: bpy.ops.wm.obj_export(
-            filepath=name, export_selected_objects=True, export_colors=True
-        ),
+        ".obj": partial(_write_obj, texture=texture),
         ".stl": lambda name: bpy.ops.wm.stl_export(filepath=name, export_selected_objects=True),
     }
     write = writers.get(path.suffix.lower())
@@ -98,11 +101,12 @@ def export(context: bpy.types.Context, result: bpy.types.Object, path: Path) -> 
         raise ValueError(f"{path} could not be written")
 
 
-def _write_glb(name: str) -> None:
+def _write_glb(name: str, *, textured: bool) -> None:
     wanted = {
         "use_selection": True,
         "export_apply": True,
-        "export_vertex_color": "ACTIVE",
+        # other programs multiply a texture by the colours of vertices
+        "export_vertex_color": "NONE" if textured else "ACTIVE",
         "export_all_vertex_colors": False,
         "export_attributes": True,
         "export_animations": False,
@@ -111,6 +115,25 @@ def _write_glb(name: str) -> None:
     bpy.ops.export_scene.gltf(
         filepath=name, export_format="GLB", **{key: value for key, value in wanted.items() if key in known}
     )
+
+
+def _write_obj(name: str, *, texture: bpy.types.Image | None) -> None:
+    """Also the texture, as a file beside under a name that is free: it is packed, which the format cannot."""
+    if texture is None:
+        bpy.ops.wm.obj_export(filepath=name, export_selected_objects=True, export_colors=True)
+        return
+    beside = _free_name(Path(name))
+    texture.save(filepath=str(beside), save_copy=True)
+    before, texture.filepath = texture.filepath, str(beside)
+    try:
+        bpy.ops.wm.obj_export(filepath=name, export_selected_objects=True, path_mode="STRIP")
+    finally:
+        texture.filepath = before
+
+
+def _free_name(path: Path) -> Path:
+    names = (path.with_name(f"{path.stem}_texture{number}.png") for number in ("", *range(2, 1000)))
+    return next(name for name in names if not name.exists())
 
 
 @contextmanager

@@ -1,19 +1,23 @@
 """Meshes and points as files: PLY with everything a vertex carries, glTF for every other program.
 
+A texture is a PNG beside a PLY, which names it as MeshLab does, and a part of a glTF file.
+
 The same record gives the same bytes. Both are written here rather than by trimesh, which drops
 attributes of its own choosing from a PLY and stores glTF colours in 8 bits, where linear light needs 16.
 Positions in a PLY are doubles: given cameras may live in map coordinates, far from the origin.
 """
 
+import io
 import json
 import struct
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool, Float, Float64, UInt8, UInt16
+from jaxtyping import Bool, Float, Float32, Float64, Int64, UInt8, UInt16
+from PIL import Image
 
 from .maths.srgb import linear_from_srgb
-from .scene import Region, SurfaceMesh, SurfacePoints, transform_points
+from .scene import Region, SurfaceMesh, SurfacePoints, Texture, transform_points
 
 _POINT_FIELDS = [(axis, "<f8") for axis in ("x", "y", "z")] + [(axis, "<f4") for axis in ("nx", "ny", "nz")]
 _COLOUR_FIELDS = [(channel, "u1") for channel in ("red", "green", "blue")]
@@ -23,6 +27,11 @@ _SPARSE_FIELDS = [*_POINT_FIELDS[:3], *_COLOUR_FIELDS]
 _SEEN = "seen_{}"
 """Names of the bytes whose bits say which photographs show a sparse point, the first in the lowest bit."""
 _FACE = np.dtype([("num_corners", "u1"), ("corners", "<i4", (3,))])
+_TEXTURED_FACE = np.dtype([*_FACE.descr, ("num_coordinates", "u1"), ("coordinates", "<f4", (3, 2))])
+_FACE_LISTS = {
+    _FACE: ("property list uchar int vertex_indices",),
+    _TEXTURED_FACE: ("property list uchar int vertex_indices", "property list uchar float texcoord"),
+}
 _PLY_NAMES = {"<f8": "double", "<f4": "float", "|u1": "uchar"}
 
 _Y_UP_FROM_Z_UP = np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]], np.float64)
@@ -31,9 +40,13 @@ _FAR_IN_SIZES = 16
 """From the origin; up to here single precision is good to a millionth of the size."""
 _GLTF_FLOAT, _GLTF_USHORT, _GLTF_UINT = 5126, 5123, 5125
 _GLTF_VERTICES, _GLTF_INDICES = 34962, 34963
+_GLTF_SAMPLER = {"magFilter": 9729, "minFilter": 9987, "wrapS": 33071, "wrapT": 33071}
+"""Linear, with mipmaps; nothing repeats."""
 
 
 SPARSE = "sparse.ply"
+TEXTURE = "texture.png"
+_TEXTURE_COMMENT = f"comment TextureFile {TEXTURE}"
 
 
 class MeshFileError(ValueError):
@@ -41,33 +54,78 @@ class MeshFileError(ValueError):
 
 
 def write_mesh(path: Path, mesh: SurfaceMesh) -> None:
-    """Write mesh.ply: binary PLY with normals, colours and `support` at each vertex."""
+    """Write mesh.ply: binary PLY with normals, colours and `support` at each vertex.
+
+    The faces of a mesh with a texture have coordinates in it, which write_texture writes beside.
+    """
     vertices = _vertex_table(_MESH_VERTEX, mesh.vertices, mesh.normals, mesh.colours_srgb)
     vertices["support"] = mesh.support
-    faces = np.zeros(len(mesh.faces), _FACE)
+    faces = np.zeros(len(mesh.faces), _FACE if mesh.texture is None else _TEXTURED_FACE)
     faces["num_corners"] = 3
     faces["corners"] = mesh.faces
-    header = _header(vertices, num_faces=len(faces))
+    if mesh.texture is not None:
+        faces["num_coordinates"] = 6
+        faces["coordinates"] = _coordinates(mesh.texture, y_down=False)
+    header = _header(vertices, faces=faces)
     path.write_bytes(header + vertices.tobytes() + faces.tobytes())
 
 
 def read_mesh(path: Path) -> SurfaceMesh:
-    """The mesh of a file written by write_mesh, without its decisions; MeshFileError for any other file."""
+    """The mesh of a file written by write_mesh, and its texture, without its decisions.
+
+    Raises MeshFileError for any other file, and where the texture is not beside it.
+    """
     header, _, body = path.read_bytes().partition(b"end_header\n")
     num_vertices, num_faces = _counts(header)
+    textured = f"{_TEXTURE_COMMENT}\n".encode() in header
+    kind = _TEXTURED_FACE if textured else _FACE
     faces_start = num_vertices * _MESH_VERTEX.itemsize
-    if len(body) != faces_start + num_faces * _FACE.itemsize:
+    if len(body) != faces_start + num_faces * kind.itemsize:
         raise MeshFileError(f"{path.name} is cut short or has other properties than a FewView mesh")
     vertices = np.frombuffer(body, _MESH_VERTEX, num_vertices)
-    if header + b"end_header\n" != _header(vertices, num_faces=num_faces):
+    faces = np.frombuffer(body, kind, num_faces, faces_start)
+    if header + b"end_header\n" != _header(vertices, faces=faces):
         raise MeshFileError(f"{path.name} has other properties than a FewView mesh")
     return SurfaceMesh(
         vertices=np.stack([vertices[axis] for axis in ("x", "y", "z")], axis=-1).astype(np.float64),
-        faces=np.frombuffer(body, _FACE, num_faces, faces_start)["corners"].astype(np.int64),
+        faces=faces["corners"].astype(np.int64),
         normals=np.stack([vertices[axis] for axis in ("nx", "ny", "nz")], axis=-1).astype(np.float32),
         colours_srgb=np.stack([vertices[name] for name, _ in _COLOUR_FIELDS], axis=-1),
         support=vertices["support"].astype(np.float32),
+        texture=_read_texture(path.with_name(TEXTURE), faces["coordinates"]) if textured else None,
     )
+
+
+def write_texture(path: Path, texture: Texture) -> None:
+    """Write texture.png."""
+    path.write_bytes(_png(texture))
+
+
+def _read_texture(path: Path, coordinates: Float32[np.ndarray, "faces 3 2"]) -> Texture:
+    try:
+        with Image.open(path) as file:
+            image = np.asarray(file.convert("RGB"))
+    except (OSError, SyntaxError, ValueError) as error:  # SyntaxError: Pillow, of a damaged PNG
+        raise MeshFileError(f"{path.name} is not beside the mesh, or damaged") from error
+    height, width = image.shape[:2]
+    corners = [0, height] + coordinates.astype(np.float64) * [width, -height]
+    return Texture(image_srgb=image, corners_px=corners.astype(np.float32))
+
+
+def _coordinates(texture: Texture, *, y_down: bool) -> Float32[np.ndarray, "faces 3 2"]:
+    """From 0 to 1 over the picture, to the right and, as glTF has it, down, or up as others do."""
+    height, width = texture.image_srgb.shape[:2]
+    shares = texture.corners_px.astype(np.float64) / [width, height]
+    if not y_down:
+        shares[..., 1] = 1 - shares[..., 1]
+    return shares.astype(np.float32)
+
+
+def _png(texture: Texture) -> bytes:
+    file = io.BytesIO()
+    # the last tenth of the size takes most of the time
+    Image.fromarray(texture.image_srgb).save(file, "PNG", compress_level=3)
+    return file.getvalue()
 
 
 def write_points(path: Path, points: SurfacePoints, region: Region) -> None:
@@ -80,7 +138,7 @@ def write_points(path: Path, points: SurfacePoints, region: Region) -> None:
         np.round(points.colours_srgb.clip(0.0, 1.0) * 255).astype(np.uint8),
     )
     table["confidence"] = points.confidence
-    path.write_bytes(_header(table, num_faces=None) + table.tobytes())
+    path.write_bytes(_header(table) + table.tobytes())
 
 
 def write_sparse(
@@ -99,7 +157,7 @@ def write_sparse(
     columns = np.hsplit(positions, 3) + np.hsplit(colours_srgb, 3) + np.split(seen, seen.shape[1], axis=1)
     for name, column in zip(table.dtype.names or (), columns, strict=True):
         table[name] = column[:, 0]
-    path.write_bytes(_header(table, num_faces=None) + table.tobytes())
+    path.write_bytes(_header(table) + table.tobytes())
 
 
 def read_sparse(
@@ -112,7 +170,7 @@ def read_sparse(
     header, end, body = path.read_bytes().partition(b"end_header\n")
     layout = _sparse_layout(num_photos)
     table = np.frombuffer(body[: len(body) // layout.itemsize * layout.itemsize], layout)
-    if len(body) != table.nbytes or header + end != _header(table, num_faces=None):
+    if len(body) != table.nbytes or header + end != _header(table):
         raise MeshFileError(f"{path.name} is cut short, or not of {num_photos} cameras")
     positions = np.stack([table[axis] for axis in ("x", "y", "z")], axis=-1)
     if not np.isfinite(positions).all():
@@ -122,7 +180,8 @@ def read_sparse(
 
 
 def write_glb(path: Path, mesh: SurfaceMesh) -> None:
-    """Write a binary glTF 2.0: y up, linear vertex colours, the custom attribute `_SUPPORT`.
+    """Write a binary glTF 2.0: y up, the custom attribute `_SUPPORT`, and the texture or, without one,
+    linear vertex colours. Where charts of the texture meet there are two vertices in place of one.
 
     Positions are in single precision, so those of a mesh far from the origin are relative to its middle,
     which the node's translation holds in double precision.
@@ -132,13 +191,21 @@ def write_glb(path: Path, mesh: SurfaceMesh) -> None:
     attributes = {
         "POSITION": (positions - middle).astype("<f4"),
         "NORMAL": (mesh.normals @ _Y_UP_FROM_Z_UP.T).astype("<f4"),
-        "COLOR_0": _linear_rgba(mesh.colours_srgb).astype("<u2"),
         "_SUPPORT": mesh.support.astype("<f4"),
     }
-    corners = mesh.faces.astype("<u4").ravel()
-    binary = b"".join(array.tobytes() for array in (*attributes.values(), corners))
-    structure = json.dumps(_gltf(attributes, corners, middle), separators=(",", ":")).encode()
+    if mesh.texture is None:
+        attributes["COLOR_0"] = _linear_rgba(mesh.colours_srgb).astype("<u2")
+        corners, picture = mesh.faces, b""
+    else:
+        vertex, coordinates, corners = _split_at_seams(mesh.faces, _coordinates(mesh.texture, y_down=True))
+        attributes = {name: values[vertex] for name, values in attributes.items()}
+        attributes["TEXCOORD_0"] = coordinates.astype("<f4")
+        picture = _png(mesh.texture)
+    indices = corners.astype("<u4").ravel()
+    binary = b"".join(array.tobytes() for array in (*attributes.values(), indices)) + picture
+    structure = json.dumps(_gltf(attributes, indices, len(picture), middle), separators=(",", ":")).encode()
     structure += b" " * (-len(structure) % 4)
+    binary += b"\0" * (-len(binary) % 4)
     size = 12 + 8 + len(structure) + 8 + len(binary)
     path.write_bytes(
         struct.pack("<4sII", b"glTF", 2, size)
@@ -147,6 +214,18 @@ def write_glb(path: Path, mesh: SurfaceMesh) -> None:
         + struct.pack("<I4s", len(binary), b"BIN\0")
         + binary
     )
+
+
+def _split_at_seams(
+    faces: Int64[np.ndarray, "faces 3"], coordinates: Float32[np.ndarray, "faces 3 2"]
+) -> tuple[Int64[np.ndarray, "split"], Float32[np.ndarray, "split 2"], Int64[np.ndarray, "faces 3"]]:
+    """Of vertices that have one place in the texture each: which they were, their places, and the faces."""
+    corners = np.empty(faces.size, np.dtype([("vertex", "i8"), ("u", "f4"), ("v", "f4")]))
+    corners["vertex"] = faces.ravel()
+    corners["u"], corners["v"] = coordinates.reshape(-1, 2).T
+    found, number = np.unique(corners, return_inverse=True)
+    places = np.stack([found["u"], found["v"]], axis=-1)
+    return found["vertex"], places, number.reshape(-1, 3).astype(np.int64)
 
 
 def _sparse_layout(num_photos: int) -> np.dtype[np.void]:
@@ -167,13 +246,16 @@ def _vertex_table(
     return table
 
 
-def _header(table: np.ndarray, *, num_faces: int | None) -> bytes:
-    """PLY header of a vertex table, and of triangles after it unless num_faces is None."""
-    lines = ["ply", "format binary_little_endian 1.0", "comment FewView", f"element vertex {len(table)}"]
+def _header(table: np.ndarray, *, faces: np.ndarray | None = None) -> bytes:
+    """PLY header of a vertex table, and of triangles after it."""
+    lines = ["ply", "format binary_little_endian 1.0", "comment FewView"]
+    if faces is not None and faces.dtype == _TEXTURED_FACE:
+        lines.append(_TEXTURE_COMMENT)
+    lines.append(f"element vertex {len(table)}")
     for name in table.dtype.names or ():
         lines.append(f"property {_PLY_NAMES[table.dtype[name].str]} {name}")
-    if num_faces is not None:
-        lines += [f"element face {num_faces}", "property list uchar int vertex_indices"]
+    if faces is not None:
+        lines += [f"element face {len(faces)}", *_FACE_LISTS[faces.dtype]]
     return "\n".join([*lines, "end_header\n"]).encode("ascii")
 
 
@@ -208,14 +290,17 @@ def _middle_if_far(positions: Float64[np.ndarray, "vertices 3"]) -> Float64[np.n
 
 
 def _gltf(
-    attributes: dict[str, np.ndarray], corners: np.ndarray, translation: Float64[np.ndarray, "3"]
+    attributes: dict[str, np.ndarray],
+    indices: np.ndarray,
+    picture_bytes: int,
+    translation: Float64[np.ndarray, "3"],
 ) -> dict[str, object]:
-    """The JSON part of the file; the arrays follow each other in the binary part."""
+    """The JSON part of the file; the arrays, and a picture, follow each other in the binary part."""
     types = {"<f4": _GLTF_FLOAT, "<u2": _GLTF_USHORT, "<u4": _GLTF_UINT}
     accessors: list[dict[str, object]] = []
     views: list[dict[str, object]] = []
     offset = 0
-    for name, array in (*attributes.items(), ("indices", corners)):
+    for name, array in (*attributes.items(), ("indices", indices)):
         target = _GLTF_INDICES if name == "indices" else _GLTF_VERTICES
         views.append({"buffer": 0, "byteOffset": offset, "byteLength": array.nbytes, "target": target})
         shape = "SCALAR" if array.ndim == 1 else f"VEC{array.shape[1]}"
@@ -237,7 +322,17 @@ def _gltf(
         "indices": len(attributes),
         "material": 0,
     }
-    surface = {"metallicFactor": 0.0, "roughnessFactor": 1.0}
+    surface: dict[str, object] = {"metallicFactor": 0.0, "roughnessFactor": 1.0}
+    pictures: dict[str, object] = {}
+    if picture_bytes:
+        surface["baseColorTexture"] = {"index": 0}
+        pictures = {
+            "images": [{"bufferView": len(views), "mimeType": "image/png", "name": "FewView"}],
+            "samplers": [_GLTF_SAMPLER],
+            "textures": [{"source": 0, "sampler": 0}],
+        }
+        views.append({"buffer": 0, "byteOffset": offset, "byteLength": picture_bytes})
+        offset += picture_bytes
     node: dict[str, object] = {"mesh": 0, "name": "FewView"}
     if translation.any():
         node["translation"] = translation.tolist()
@@ -248,7 +343,8 @@ def _gltf(
         "nodes": [node],
         "meshes": [{"name": "FewView", "primitives": [primitive]}],
         "materials": [{"pbrMetallicRoughness": surface, "doubleSided": True}],
+        **pictures,
         "accessors": accessors,
         "bufferViews": views,
-        "buffers": [{"byteLength": offset}],
+        "buffers": [{"byteLength": offset + -offset % 4}],
     }

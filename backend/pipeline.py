@@ -33,6 +33,7 @@ from .stages.cameras import solve_cameras
 from .stages.confirmation import unconfirmed
 from .stages.mesh import extract_mesh
 from .stages.neus_fit import NeusConfig, fit_neus
+from .stages.originals import Original
 from .stages.outlines_alone import hollows_filled
 from .stages.photos import load_photos, match_masks, named_photos, without_masks_text
 from .stages.radiance_field import Radiance
@@ -267,7 +268,10 @@ def run(job: Job, workspace: Workspace, *, settings: Settings, stages: Stages, l
         name = job.output.resolve().name
         told = build_camera_report(solved, region, job_name=name, seed=job.seed, versions=versions())
         return Outcome(files=write_cameras(told, workspace, frame=frame), summary=cameras_summary(told))
-    inputs, radiance = _reconstructed(job, this, settings, stages, placed=(solved, region, device))
+    lenses = zip(solved.views, solved.lenses, strict=True)
+    originals = tuple(Original(path=files.photos[view.name], lens=lens) for view, lens in lenses)
+    placed = (solved, region, device)
+    inputs, radiance = _reconstructed(job, this, settings, stages, placed=placed, originals=originals)
     report = this.unkept_stage("report", partial(stages.build_report, inputs, settings.report))
     return Outcome(files=write_all(report, radiance, workspace, frame=frame), summary=summary(report))
 
@@ -323,6 +327,7 @@ def _reconstructed(
     stages: Stages,
     *,
     placed: tuple[SolvedCameras, Region, torch.device],
+    originals: tuple[Original, ...],
 ) -> tuple[ReportInputs, Radiance | None]:
     """The mesh, with all that the report tells of it, and the field to render from, where there is one."""
     solved, region, device = placed
@@ -340,7 +345,7 @@ def _reconstructed(
     show = partial(previews.show_surface, points=stereo.points, region=region)
     fit = partial(stages.fit_surface, views, region, stereo, settings.train, show=show, **chance)
     surface = this.stage("train", fit)
-    extract = partial(stages.extract_mesh, views, region, stereo, surface, settings.mesh)
+    extract = partial(stages.extract_mesh, views, region, stereo, surface, settings.mesh, originals=originals)
     mesh = this.stage("mesh", extract)
     inputs = ReportInputs(
         job_name=job.output.resolve().name,

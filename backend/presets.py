@@ -15,6 +15,7 @@ from .stages.radiance_fit import RadianceConfig
 from .stages.region import RegionConfig
 from .stages.report import ReportConfig
 from .stages.stereo_config import StereoConfig
+from .stages.texture import TextureConfig
 from .stages.train import TrainConfig
 
 
@@ -58,13 +59,13 @@ PRESETS = MappingProxyType(
             train=TrainConfig(
                 levels=(32, 64, 96), rounds=(10, 10, 5), looks=(0, 3, 2), linear=LinearConfig(settled=0.01)
             ),
-            mesh=MeshConfig(max_faces=100_000),
+            mesh=MeshConfig(max_faces=25_000, texture=TextureConfig(max_photo_px=1600)),
         ),
         "balanced": Settings(photos=PhotosConfig(max_side_px=1024)),
         "detailed": Settings(
             photos=PhotosConfig(max_side_px=1600),
             train=TrainConfig(levels=(32, 64, 128, 192), rounds=(15, 15, 10, 10), steps=(0, 0, 0, 200)),
-            mesh=MeshConfig(max_faces=500_000),
+            mesh=MeshConfig(max_faces=200_000, texture=TextureConfig(max_photo_px=4096, max_side_px=8192)),
         ),
         "nerf": Settings(photos=PhotosConfig(max_side_px=800), stereo=None, train=RadianceConfig()),
         "neus": Settings(photos=PhotosConfig(max_side_px=800), stereo=None, train=NeusConfig()),
@@ -92,7 +93,7 @@ PRESETS = MappingProxyType(
                 constant=1 / 60,
                 nodes=512,
             ),
-            mesh=MeshConfig(max_faces=500_000),
+            mesh=MeshConfig(max_faces=200_000),
         ),
         "sparsecraft-published": Settings(
             photos=PhotosConfig(max_side_px=1600),
@@ -108,7 +109,7 @@ PRESETS = MappingProxyType(
                 sampling=Sampling(rays=1024, uniform=64, rounds=4, per_round=16, point_queries=5000),
                 nodes=512,
             ),
-            mesh=MeshConfig(max_faces=500_000),
+            mesh=MeshConfig(max_faces=200_000),
         ),
     }
 )

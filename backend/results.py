@@ -7,7 +7,7 @@ from pathlib import Path
 
 from .errors import ErrorCode, ReconstructionError
 from .maths.sampling import mean_colours
-from .mesh_files import SPARSE, write_glb, write_mesh, write_points, write_sparse
+from .mesh_files import SPARSE, TEXTURE, write_glb, write_mesh, write_points, write_sparse, write_texture
 from .records import save_record
 from .scene import Region, SolvedCameras
 from .stages.camera_report import CameraReport, camera_report_html, camera_report_numbers
@@ -22,7 +22,7 @@ Writers = dict[str, Callable[[Path], object]]
 
 RADIANCE = "radiance.npz"
 """A radiance field that was fitted, to render from: no pickle, arrays and JSON."""
-_OF_WHOLE_RUNS = ("mesh.ply", "mesh.glb", "points.ply", "report.json", "report.html", RADIANCE)
+_OF_WHOLE_RUNS = ("mesh.ply", TEXTURE, "mesh.glb", "points.ply", "report.json", "report.html", RADIANCE)
 _CAMERA_PAGES = ("cameras_report.json", "cameras.html")
 
 
@@ -42,10 +42,12 @@ def write_all(
         "report.json": _text(_json(report_numbers(report))),
         "report.html": _text(render_report_html(report)),
     }
+    if inputs.mesh.texture is not None:
+        writers[TEXTURE] = partial(write_texture, texture=inputs.mesh.texture)
     if radiance is not None:
         writers[RADIANCE] = partial(save_record, record=radiance, hint=Radiance)
     outdated = () if workspace.frame == frame else _CAMERA_PAGES
-    workspace.write_results(writers, replaced=(RADIANCE, *outdated), frame=frame)
+    workspace.write_results(writers, replaced=(RADIANCE, TEXTURE, *outdated), frame=frame)
     return (*writers, LOG)
 
 

@@ -240,6 +240,15 @@ class StereoResult:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Texture:
+    """A picture that is laid on a mesh."""
+
+    image_srgb: UInt8[np.ndarray, "height width 3"]
+    corners_px: Float32[np.ndarray, "faces 3 2"]
+    """Where in the picture each face's corners lie: (x, y), from the outer corner of its top left pixel."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class SurfaceMesh:
     """A triangle mesh, world frame; faces are counter-clockwise seen from outside."""
 
@@ -249,6 +258,8 @@ class SurfaceMesh:
     colours_srgb: UInt8[np.ndarray, "vertices 3"]
     support: Float32[np.ndarray, "vertices"]
     """How well the photographs back the vertex: 0 seen by none, a guess; 1 seen and measured by several."""
+    texture: Texture | None = None
+    """Finer than the colours of the vertices; None where there is none."""
     decisions: tuple[Decision, ...] = ()
 
 

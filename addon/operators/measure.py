@@ -32,7 +32,7 @@ class FEWVIEW_OT_measure_error(OnResult, bpy.types.Operator):
             while True:
                 next(steps)
         except StopIteration as end:
-            return self._finished(end)
+            return self._finished(context, end)
         except ValueError as error:
             return refused(self, error)
 
@@ -55,7 +55,7 @@ class FEWVIEW_OT_measure_error(OnResult, bpy.types.Operator):
         try:
             done = next(self._measuring)
         except StopIteration as end:
-            return self._ended(context, self._finished(end))
+            return self._ended(context, self._finished(context, end))
         except ValueError as error:
             return self._ended(context, refused(self, error))
         context.workspace.status_text_set(f"Measuring the error: {done:.0%}  (Esc to cancel)")
@@ -76,9 +76,9 @@ class FEWVIEW_OT_measure_error(OnResult, bpy.types.Operator):
             raise ValueError(f"There is no object {', '.join(missing)} in this scene")
         return [objects[name] for name in names]
 
-    def _finished(self, end: StopIteration) -> Status:
+    def _finished(self, context: bpy.types.Context, end: StopIteration) -> Status:
         self.report({"INFO"}, end.value.text)
-        colours.show_in_viewports()
+        colours.show_in_viewports(result_of(context, self.object_name).data)
         return {"FINISHED"}
 
     def _ended(self, context: bpy.types.Context, status: Status) -> Status:

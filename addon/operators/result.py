@@ -97,10 +97,11 @@ class _Show(OnResult):
 
     def execute(self, context: bpy.types.Context) -> Status:
         try:
-            colours.show(result_of(context, self.object_name).data, self.kind)
+            mesh = result_of(context, self.object_name).data
+            colours.show(mesh, self.kind)
         except ValueError as error:
             return refused(self, error)
-        colours.show_in_viewports()
+        colours.show_in_viewports(mesh)
         return {"FINISHED"}
 
 

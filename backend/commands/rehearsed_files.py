@@ -6,6 +6,7 @@ tests hold the two together.
 import json
 import math
 import struct
+import zlib
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -14,6 +15,8 @@ _CORNERS = ((1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1))
 _FACES = ((0, 1, 2), (0, 3, 1), (0, 2, 3), (1, 3, 2))
 """Counter-clockwise seen from outside."""
 _COLOURS = ((200, 60, 60), (60, 200, 60), (60, 60, 200), (200, 200, 60))
+_SIDES = ((230, 230, 230), (160, 160, 160), (110, 110, 110), (60, 60, 60))
+"""Colours of the faces in the texture."""
 _SUPPORT = (1.0, 0.7, 0.3, 0.0)
 
 _POSITION = tuple(f"property double {axis}" for axis in "xyz")
@@ -33,14 +36,33 @@ _PAGE = """<!DOCTYPE html>
 def write_mesh(path: Path, *, size: float = 1.0) -> None:
     """Write the tetrahedron as mesh.ply; its corners are `size` times the root of 3 from the origin."""
     vertex = (*_POSITION, *_NORMAL, *_COLOUR, "property float support")
-    face = (f"element face {len(_FACES)}", "property list uchar int vertex_indices")
+    face = (
+        f"element face {len(_FACES)}",
+        "property list uchar int vertex_indices",
+        "property list uchar float texcoord",
+    )
     unit = 1 / math.sqrt(3)
     body = b"".join(
         struct.pack("<3d3f3Bf", *(size * x for x in corner), *(unit * x for x in corner), *colour, support)
         for corner, colour, support in zip(_CORNERS, _COLOURS, _SUPPORT, strict=True)
     )
-    body += b"".join(struct.pack("<B3i", 3, *corners) for corners in _FACES)
-    path.write_bytes(_header((*vertex, *face)) + body)
+    for number, corners in enumerate(_FACES):
+        left, right = (number + 0.125) / len(_FACES), (number + 0.875) / len(_FACES)
+        body += struct.pack("<B3iB6f", 3, *corners, 6, left, 0.125, right, 0.125, left, 0.875)
+    path.write_bytes(_header((*vertex, *face), texture=True) + body)
+
+
+def write_texture(path: Path) -> None:
+    """Write texture.png: a square in the colour of each face, side by side."""
+    side = 8
+    row = b"\0" + b"".join(bytes(colour) * side for colour in _SIDES)
+    size = struct.pack(">2I5B", side * len(_SIDES), side, 8, 2, 0, 0, 0)
+    chunks = ((b"IHDR", size), (b"IDAT", zlib.compress(row * side)), (b"IEND", b""))
+    path.write_bytes(b"\x89PNG\r\n\x1a\n" + b"".join(_chunk(name, content) for name, content in chunks))
+
+
+def _chunk(name: bytes, content: bytes) -> bytes:
+    return struct.pack(">I", len(content)) + name + content + struct.pack(">I", zlib.crc32(name + content))
 
 
 def write_sparse(path: Path) -> None:
@@ -110,6 +132,7 @@ def write_page(path: Path) -> None:
 RESULTS = MappingProxyType(
     {
         "mesh.ply": write_mesh,
+        "texture.png": write_texture,
         "sparse.ply": write_sparse,
         "cameras.json": write_cameras,
         "report.json": write_report_numbers,
@@ -119,8 +142,9 @@ RESULTS = MappingProxyType(
 """How each file is written, by its name."""
 
 
-def _header(lines: tuple[str, ...]) -> bytes:
-    first = ("ply", "format binary_little_endian 1.0", "comment FewView", f"element vertex {len(_CORNERS)}")
+def _header(lines: tuple[str, ...], *, texture: bool = False) -> bytes:
+    comments = ("comment FewView", *(("comment TextureFile texture.png",) if texture else ()))
+    first = ("ply", "format binary_little_endian 1.0", *comments, f"element vertex {len(_CORNERS)}")
     return "\n".join([*first, *lines, "end_header\n"]).encode("ascii")
 
 

@@ -4,6 +4,8 @@ import numpy as np
 from jaxtyping import Bool, Float64
 from scipy.sparse.csgraph import minimum_spanning_tree
 
+from .srgb import linear_from_srgb, srgb_from_linear
+
 _NEAREST = 3
 """Photographs that each one is compared with, beside those that join all that can be joined."""
 
@@ -27,6 +29,15 @@ def log_exposures(
     # Of all solutions the shortest: that whose mean is 0.
     solution: Float64[np.ndarray, "views"] = np.linalg.lstsq(rows, wanted, rcond=None)[0]
     return solution
+
+
+def evened(
+    srgb: Float64[np.ndarray, "points 3"], log_exposure: Float64[np.ndarray, "3"]
+) -> Float64[np.ndarray, "points 3"]:
+    """Colours of a photograph as they were without its exposure; the same where that is 0."""
+    if not log_exposure.any():
+        return srgb
+    return srgb_from_linear(linear_from_srgb(srgb) * np.exp(-log_exposure))
 
 
 def disagreement(

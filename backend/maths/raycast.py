@@ -14,6 +14,7 @@ from embreex.rtcore_scene import EmbreeScene
 from jaxtyping import Bool, Float, Float32, Float64, Int, Int64
 
 from ..scene import Camera, SurfaceMesh
+from .bilinear import bilinear, shrunk
 from .projection import in_picture, projected
 
 EVERYTHING = slice(None)
@@ -47,7 +48,7 @@ class MeshImage:
     """A mesh as a camera sees it, without light or shading."""
 
     colour_srgb: Float32[np.ndarray, "height width 3"]
-    """Interpolated vertex colours; 0 where not covered."""
+    """Of the texture or, without one, of the vertices; 0 where not covered."""
     coverage: Bool[np.ndarray, "height width"]
     """True where the pixel's centre shows the mesh."""
     depth: Float32[np.ndarray, "height width"]
@@ -169,12 +170,40 @@ def render_mesh(mesh: SurfaceMesh, camera: Camera, *, caster: RayCaster | None =
     lengths = np.linalg.norm(normals, axis=-1, keepdims=True)
     depth = (hits.distance[hit, None] * directions[hit]) @ camera.camera_from_world[2, :3]
     return MeshImage(
-        colour_srgb=picture(interpolate(mesh.colours_srgb, corners, weights) / 255.0),
+        colour_srgb=_colours(mesh, hits.face[hit], weights, coverage),
         coverage=coverage,
         depth=picture(depth, beside=np.inf),
         normal_world=picture(normals / np.where(lengths > 0, lengths, 1.0)),
         support=picture(interpolate(mesh.support, corners, weights)),
     )
+
+
+def _colours(
+    mesh: SurfaceMesh,
+    face: Int64[np.ndarray, "hits"],
+    weights: Float64[np.ndarray, "hits 3"],
+    coverage: Bool[np.ndarray, "height width"],
+) -> Float32[np.ndarray, "height width 3"]:
+    """sRGB, 0 to 1, where the picture is covered by these places of faces; else 0."""
+    colours = np.zeros((*coverage.shape, 3), np.float32)
+    if mesh.texture is None:
+        colours[coverage] = interpolate(mesh.colours_srgb, mesh.faces[face], weights) / 255.0
+        return colours
+    places = np.zeros((*coverage.shape, 2))
+    places[coverage] = np.einsum("hk,hkd->hd", weights, mesh.texture.corners_px[face])
+    times = _texels_a_pixel(places, coverage)
+    texels = shrunk(mesh.texture.image_srgb, times)
+    colours[coverage] = bilinear(texels, places[coverage] / times) / 255.0
+    return colours
+
+
+def _texels_a_pixel(
+    places: Float64[np.ndarray, "height width 2"], coverage: Bool[np.ndarray, "height width"]
+) -> int:
+    """How many texels most pixels are apart: where they are several, their mean is what a pixel shows."""
+    both = coverage[:, 1:] & coverage[:, :-1]
+    apart = np.linalg.norm(np.diff(places, axis=1)[both], axis=-1)
+    return max(1, round(float(np.median(apart)))) if len(apart) else 1
 
 
 def part_that_may_show(points: Float[np.ndarray, "points 3"], camera: Camera) -> tuple[slice, slice]:

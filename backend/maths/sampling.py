@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Bool, Float64, UInt8
 
 from ..scene import View
+from .bilinear import bilinear
 from .projection import in_picture, projected
 
 _UNSEEN_GREY = 128
@@ -16,20 +17,13 @@ def colours_at(view: View, points: Float64[np.ndarray, "points 3"]) -> Float64[n
 
     The points lie in front of the camera; beyond the border the nearest pixel counts.
     """
-    pixel = projected(points, view.camera)[0] - 0.5
-    limit = np.array([view.camera.width - 1, view.camera.height - 1])
-    low = np.clip(np.floor(pixel), 0, np.maximum(limit - 1, 0)).astype(int)
-    t = np.clip(pixel - low, 0, 1)
-    (x, y), (s, u) = low.T, t.T[..., None]
-    mask = np.ones(view.image_srgb.shape[:2], np.float32) if view.mask is None else view.mask
-    image, right, down = (
-        np.dstack([view.image_srgb, mask]),
-        np.minimum(x + 1, limit[0]),
-        np.minimum(y + 1, limit[1]),
-    )
-    upper = image[y, x] * (1 - s) + image[y, right] * s
-    lower = image[down, x] * (1 - s) + image[down, right] * s
-    return np.asarray(upper * (1 - u) + lower * u, np.float64)
+    pixels, _ = projected(points, view.camera)
+    return np.column_stack([bilinear(view.image_srgb, pixels), mask_at(view, pixels)])
+
+
+def mask_at(view: View, pixels: Float64[np.ndarray, "points 2"]) -> Float64[np.ndarray, "points"]:
+    """Mask of a photograph at places of it; 1 where it has none."""
+    return np.ones(len(pixels)) if view.mask is None else bilinear(view.mask[..., None], pixels)[:, 0]
 
 
 def mean_colours(

@@ -4,7 +4,7 @@
 being seen, both growing with how much evidence there is and saturating.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import fast_simplification
 import numpy as np
@@ -30,7 +30,9 @@ from ..scene import (
     within,
 )
 from .measurements import SURE
+from .originals import Original
 from .surface import Surface
+from .texture import TextureConfig, paint
 from .vertex_colours import colour_vertices
 
 Vertices = Float64[np.ndarray, "vertices 3"]
@@ -60,11 +62,11 @@ PREVIEW_NODES, PREVIEW_FACES = 64, 20_000
 class MeshConfig:
     """What the mesh may look like."""
 
-    max_faces: int = 200_000
+    max_faces: int = 50_000
     smallest_piece: float = 0.02
     """Pieces with a smaller share of the largest one's area are dropped as floating."""
-    subdivided: bool = True
-    """Whether a mesh of few faces gets more of them, for colour."""
+    texture: TextureConfig | None = field(default_factory=TextureConfig)
+    """None for colours of vertices alone."""
     exposures_evened: bool = True
     """Whether photographs of other exposure or white balance are brought to the mean of all, for colour."""
 
@@ -76,11 +78,13 @@ def extract_mesh(
     surface: Surface,
     config: MeshConfig,
     *,
+    originals: tuple[Original, ...] | None = None,
     progress: Progress,
 ) -> SurfaceMesh:
     """The zero level as a coloured mesh in the world frame.
 
-    Raises ReconstructionError(NO_SURFACE) if the field has no zero level.
+    `originals`, one for each view, are read again for the texture. Raises ReconstructionError(NO_SURFACE) if
+    the field has no zero level, and PHOTO_UNREADABLE.
     """
     vertices, faces = simplified_level_set(surface, config, progress=within(progress, 0.0, 0.4))
     progress(0.4, "support")
@@ -103,25 +107,21 @@ def extract_mesh(
     used = np.unique(faces[kept])
     vertices, faces = only_used(vertices, faces[kept])
     normals, seen, support = normals[used], seen[used], support[used]
-    if config.subdivided and 2 * len(faces) <= config.max_faces:
-        # Room for more vertices is room for colour: photographs are finer than the grid. Flat places lose
-        # faces first, so that as many as there is room for carry more colour and hardly less shape.
-        vertices, faces = simplified(vertices, faces, config.max_faces // 4)
-        vertices, faces = trimesh.remesh.subdivide(vertices, faces)  # type: ignore[no-untyped-call]
-        normals, seen, support = backing(vertices, faces)
-    progress(0.7, "colour")
-    colours, exposure = colour_vertices(
-        vertices, normals, seen, views, exposures_evened=config.exposures_evened
-    )
-    decisions = (*decisions, exposure)
-    return SurfaceMesh(
+    progress(0.6, "colour")
+    coloured = colour_vertices(vertices, normals, seen, views, exposures_evened=config.exposures_evened)
+    mesh = SurfaceMesh(
         vertices=vertices,
         faces=faces,
         normals=normals.astype(np.float32),
-        colours_srgb=colours,
+        colours_srgb=coloured.colours_srgb,
         support=support,
-        decisions=decisions,
+        decisions=(*decisions, coloured.decision),
     )
+    if config.texture is None:
+        return mesh
+    progress(0.7, "texture")
+    texture = paint(mesh, seen, views, originals, coloured.log_exposures, config.texture)
+    return replace(mesh, texture=texture)
 
 
 def preview_mesh(

@@ -1,15 +1,16 @@
 """Colours of the mesh's vertices from the photographs, and whether these were exposed alike."""
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float64, UInt8
 
-from ..maths.exposure import disagreement, log_exposures
+from ..maths.exposure import disagreement, evened, log_exposures
 from ..maths.nearest import nearest_tree
 from ..maths.sampling import colours_at
-from ..maths.srgb import linear_from_srgb, srgb_from_linear
-from ..scene import Decision, View
+from ..maths.srgb import linear_from_srgb
+from ..scene import Camera, Decision, View
 
 _WHAT = "exposure of each photograph"
 _LEAST_STOPS = 0.05
@@ -25,6 +26,16 @@ _SURE_SHARE = 0.1
 the subject."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class VertexColours:
+    """What the photographs say of the vertices."""
+
+    colours_srgb: UInt8[np.ndarray, "vertices 3"]
+    log_exposures: Float64[np.ndarray, "views 3"]
+    """Natural logarithms that each photograph's channels were corrected by; 0 where they were left."""
+    decision: Decision
+
+
 def colour_vertices(
     vertices: Float64[np.ndarray, "vertices 3"],
     normals: Float64[np.ndarray, "vertices 3"],
@@ -32,7 +43,7 @@ def colour_vertices(
     views: tuple[View, ...],
     *,
     exposures_evened: bool = True,
-) -> tuple[UInt8[np.ndarray, "vertices 3"], Decision]:
+) -> VertexColours:
     """Mean of the photographs that see a vertex, those that see it frontally first; others from around.
 
     Photographs of other exposure or white balance are brought to the mean of all first, if there are such and
@@ -42,15 +53,12 @@ def colour_vertices(
     share = np.zeros((len(views), len(vertices)))
     for index, view in enumerate(views):
         mine = np.flatnonzero(seen[:, index])
-        towards = view.camera.position - vertices[mine]
-        facing = (towards * normals[mine]).sum(axis=1) / np.linalg.norm(towards, axis=1)
         sampled = colours_at(view, vertices[mine])
-        # a pixel half off the subject has half the backdrop's colour: the fourth power leaves it out
-        share[index, mine] = (np.clip(facing, 1e-3, 1) * sampled[:, 3]) ** 4
+        frontal = frontal_share(vertices[mine], normals[mine], view.camera)
+        share[index, mine] = frontal * on_subject(sampled[:, 3])
         srgb[index, mine] = sampled[:, :3]
     exposures, decision = _exposures(srgb, share) if exposures_evened else _not_asked(len(views))
-    if exposures.any():
-        srgb = srgb_from_linear(linear_from_srgb(srgb) * np.exp(-exposures)[:, None])
+    srgb = np.stack([evened(shown, by) for shown, by in zip(srgb, exposures, strict=True)])
     weight = share.sum(axis=0)
     known = weight > 0
     colours = (share[..., None] * srgb).sum(axis=0) / np.where(known, weight, 1.0)[:, None]
@@ -59,7 +67,22 @@ def colour_vertices(
         near = 1 / (np.atleast_2d(distance.T).T + 1e-3 * np.ptp(vertices, axis=0).max())
         mixed = (near[..., None] * colours[known][np.atleast_2d(nearest.T).T]).sum(axis=1)
         colours[~known] = mixed / near.sum(axis=1, keepdims=True)
-    return np.clip(colours * 255 + 0.5, 0, 255).astype(np.uint8), decision
+    rounded = np.clip(colours * 255 + 0.5, 0, 255).astype(np.uint8)
+    return VertexColours(colours_srgb=rounded, log_exposures=exposures, decision=decision)
+
+
+def on_subject(mask: Float64[np.ndarray, "places"]) -> Float64[np.ndarray, "places"]:
+    """How much a pixel counts by its mask: half off the subject, it has half the backdrop's colour."""
+    return np.where(mask > 0.5, mask**4, 0.0)
+
+
+def frontal_share(
+    vertices: Float64[np.ndarray, "vertices 3"], normals: Float64[np.ndarray, "vertices 3"], camera: Camera
+) -> Float64[np.ndarray, "vertices"]:
+    """How much a camera's photograph counts where it sees a vertex: the fourth power of the cosine."""
+    towards = camera.position - vertices
+    facing = (towards * normals).sum(axis=1) / np.linalg.norm(towards, axis=1)
+    return np.asarray(np.clip(facing, 1e-3, 1) ** 4)
 
 
 def _not_asked(num_views: int) -> tuple[Float64[np.ndarray, "views 3"], Decision]:

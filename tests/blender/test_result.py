@@ -2,9 +2,11 @@
 
 import importlib
 import os
+import shutil
 import struct
 import sys
 import time
+import zlib
 from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
@@ -390,7 +392,7 @@ def result(make_job: JobMaker) -> object:
     return bpy.context.scene.fewview.result
 
 
-def render(tmp_path: Path, engine: str) -> np.ndarray:
+def render(tmp_path: Path, engine: str, color_type: str = "VERTEX") -> np.ndarray:
     """(64, 64, 4) float, sRGB: the object from the front, lit by a white world where it takes light."""
     scene = bpy.context.scene
     camera = bpy.data.objects.new("camera", bpy.data.cameras.new("camera"))
@@ -412,7 +414,7 @@ def render(tmp_path: Path, engine: str) -> np.ndarray:
         background.inputs[0].default_value = (1, 1, 1, 1)
         scene.world = world
     else:
-        scene.display.shading.light, scene.display.shading.color_type = "FLAT", "VERTEX"
+        scene.display.shading.light, scene.display.shading.color_type = "FLAT", color_type
         scene.display.render_aa = "OFF"
     bpy.ops.render.render(write_still=True)
     image = bpy.data.images.load(scene.render.filepath)
@@ -491,6 +493,156 @@ def test_the_material_is_found_in_any_language(result: object) -> None:
     assert types == {"ShaderNodeOutputMaterial", "ShaderNodeBsdfPrincipled", "ShaderNodeVertexColor"}
     assert len(material.node_tree.links) == 2
     assert 0.2 < material.diffuse_color[0] < 0.6
+
+
+# The texture
+
+QUARTERS = {
+    (20, 24): (230, 30, 30),
+    (20, 40): (30, 230, 30),
+    (44, 24): (30, 30, 230),
+    (44, 40): (230, 230, 30),
+}
+"""sRGB of the texture's quarters, at pixels (row, column) of `render` that show them."""
+
+
+def write_textured(folder: Path) -> None:
+    """A sphere as seen from the front, laid over a texture of four quarters; its vertices are grey."""
+    vertices, faces = sphere()
+    write_ply(folder / "mesh.ply", vertices, faces, red=90, green=90, blue=90)
+    header, _, body = (folder / "mesh.ply").read_bytes().partition(b"end_header\n")
+    start = len(vertices) * VERTEX.itemsize
+    records = np.zeros(len(faces), [*FACE.descr, ("num_uv", "u1"), ("uv", "<f4", (3, 2))])
+    records["num"], records["corners"], records["num_uv"] = 3, faces, 6
+    records["uv"] = vertices[faces][..., [0, 2]] / 2 + 0.5
+    header += b"property list uchar float texcoord\nend_header\n"
+    (folder / "mesh.ply").write_bytes(header + body[:start] + records.tobytes())
+    top, bottom = np.array(list(QUARTERS.values())).reshape(2, 2, 3)
+    rows = [np.repeat(row, 8, axis=0).astype(np.uint8).tobytes() for row in (top, bottom) for _ in range(8)]
+    data = zlib.compress(b"".join(b"\0" + row for row in rows))
+    chunks = ((b"IHDR", struct.pack(">2I5B", 16, 16, 8, 2, 0, 0, 0)), (b"IDAT", data), (b"IEND", b""))
+    (folder / "texture.png").write_bytes(
+        b"\x89PNG\r\n\x1a\n"
+        + b"".join(
+            struct.pack(">I", len(what)) + name + what + struct.pack(">I", zlib.crc32(name + what))
+            for name, what in chunks
+        )
+    )
+
+
+@pytest.fixture
+def textured(make_job: JobMaker) -> object:
+    folder = make_job()
+    write_textured(folder / "result")
+    bpy.ops.fewview.import_result(folder=str(folder))
+    shutil.rmtree(folder)  # the picture is a part of the scene
+    return bpy.context.scene.fewview.result
+
+
+def colours_at(picture: np.ndarray) -> np.ndarray:
+    return 255 * np.array([picture[place][:3] for place in QUARTERS])
+
+
+@pytest.mark.parametrize("engine", ["CYCLES", WORKBENCH])
+def test_a_texture_is_rendered_in_place_of_the_vertices_colours(
+    textured: object, tmp_path: Path, parts: SimpleNamespace, engine: str
+) -> None:
+    assert parts.colours.shows_texture(textured.data)
+    picture = render(tmp_path, engine, color_type="TEXTURE")
+    np.testing.assert_allclose(colours_at(picture), list(QUARTERS.values()), atol=12)
+
+
+def test_support_takes_the_place_of_a_texture_and_gives_it_back(
+    textured: object, tmp_path: Path, parts: SimpleNamespace
+) -> None:
+    bpy.ops.fewview.show_support()
+    assert not parts.colours.shows_texture(textured.data)
+    picture = render(tmp_path, "CYCLES")
+    found = np.array([picture[place][:3] for place in PLACES])
+    expected = expected_colours(byte_colours(textured.data, "Support Map"), positions(textured), PLACES)
+    np.testing.assert_allclose(found, expected, atol=0.06)
+    bpy.ops.fewview.show_colour()
+    np.testing.assert_allclose(colours_at(render(tmp_path, "CYCLES")), list(QUARTERS.values()), atol=12)
+
+
+def test_a_material_that_the_user_changed_is_left_alone(textured: object, parts: SimpleNamespace) -> None:
+    (material,) = textured.data.materials
+    tree = material.node_tree
+    surface = next(node for node in tree.nodes if node.type == "BSDF_PRINCIPLED")
+    own = tree.nodes.new("ShaderNodeRGB")
+    tree.links.new(own.outputs[0], surface.inputs["Base Color"])
+    parts.colours.show(textured.data, "SUPPORT")
+    (link,) = surface.inputs["Base Color"].links
+    assert link.from_node == own
+
+
+def test_the_picture_of_a_texture_is_packed(textured: object) -> None:
+    (image,) = bpy.data.images
+    assert image.packed_file is not None
+    assert tuple(image.size) == (16, 16)
+
+
+def test_without_its_picture_a_mesh_shows_its_vertices_colours(
+    make_job: JobMaker, tmp_path: Path, parts: SimpleNamespace
+) -> None:
+    folder = make_job()
+    write_textured(folder / "result")
+    (folder / "result/texture.png").unlink()
+    bpy.ops.fewview.import_result(folder=str(folder))
+    assert not parts.colours.shows_texture(bpy.context.scene.fewview.result.data)
+    np.testing.assert_allclose(colours_at(render(tmp_path, "CYCLES")), np.full((4, 3), 90), atol=4)
+
+
+def test_a_picture_that_leads_out_of_the_job_is_not_taken(make_job: JobMaker, tmp_path: Path) -> None:
+    folder = make_job()
+    write_textured(folder / "result")
+    (folder / "result/texture.png").rename(tmp_path / "mine.png")
+    (folder / "result/texture.png").symlink_to(tmp_path / "mine.png")
+    with pytest.raises(RuntimeError, match="outside"):
+        bpy.ops.fewview.import_result(folder=str(folder))
+
+
+def test_a_remeshed_result_has_no_texture_and_shows_its_vertices_colours(
+    textured: object, tmp_path: Path, parts: SimpleNamespace
+) -> None:
+    bpy.ops.fewview.remesh()
+    assert parts.colours.shown(textured.data) == "COLOUR"
+    assert not parts.colours.shows_texture(textured.data)
+    np.testing.assert_allclose(colours_at(render(tmp_path, "CYCLES")), np.full((4, 3), 90), atol=4)
+
+
+@pytest.mark.parametrize("ending", [".glb", ".obj"])
+def test_an_exported_texture_comes_back_alone(textured: object, tmp_path: Path, ending: str) -> None:
+    """Viewers multiply it by the vertices' colours where a file has both."""
+    path = tmp_path / f"mesh{ending}"
+    bpy.ops.fewview.export(filepath=str(path))
+    bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
+    if ending == ".glb":
+        bpy.ops.import_scene.gltf(filepath=str(path))
+    else:
+        bpy.ops.wm.obj_import(filepath=str(path))
+    (back,) = [made for made in bpy.data.objects if made.type == "MESH"]
+    assert len(back.data.uv_layers) == 1
+    assert not back.data.color_attributes
+    (image,) = [image for image in bpy.data.images if image.size[0] == 16]
+    if ending == ".obj":
+        assert Path(bpy.path.abspath(image.filepath)) == tmp_path / "mesh_texture.png"
+    corner = 255 * np.array(image.pixels[:], np.float32).reshape(16, 16, 4)[-1, 0, :3]
+    np.testing.assert_allclose(corner, QUARTERS[20, 24], atol=1)
+
+
+def test_the_picture_beside_an_obj_replaces_no_other(textured: object, tmp_path: Path) -> None:
+    (tmp_path / "mesh_texture.png").write_text("mine")
+    for _ in range(2):
+        bpy.ops.fewview.export(filepath=str(tmp_path / "mesh.obj"), overwrite=True)
+    assert (tmp_path / "mesh_texture.png").read_text() == "mine"
+    assert {path.name for path in tmp_path.glob("mesh_texture?*.png")} == {
+        "mesh_texture2.png",
+        "mesh_texture3.png",
+    }
+    (image,) = bpy.data.images
+    assert image.packed_file is not None
+    assert "mesh_texture" not in image.filepath
 
 
 # The error

@@ -409,34 +409,6 @@ def test_a_piece_of_a_larger_scene_loses_its_back() -> None:
     assert lengths == {mesh.faces.max() + 1}
 
 
-def test_room_that_the_cut_leaves_is_room_for_color() -> None:
-    """The level set is too large to be subdivided as it is; what is left of it is not."""
-    stereo = measured(floor_points(), edge_confidence=0.6)
-    scene, size = body_scene().without_masks(), len(level_set(floor_surface())[1])
-    plain = extract(scene, floor_surface(), stereo, MeshConfig(subdivided=False))
-    fine = extract(scene, floor_surface(), stereo, MeshConfig(max_faces=3 * size))
-    assert len(plain.faces) < 0.75 * size
-    assert len(fine.faces) == 4 * len(plain.faces)
-    lengths = {len(fine.vertices), len(fine.normals), len(fine.colours_srgb), len(fine.support)}
-    assert lengths == {fine.faces.max() + 1}
-
-
-def test_a_mesh_that_is_half_of_what_may_be_gets_finer_colour_on_hardly_another_shape() -> None:
-    """Four times its faces would be too many: it loses some first."""
-    _, faces = level_set(body_surface())
-    plain = extract(body_scene(), body_surface(), measured(front_points()), MeshConfig(subdivided=False))
-    fine = extract(
-        body_scene(), body_surface(), measured(front_points()), MeshConfig(max_faces=2 * len(faces))
-    )
-    coarse = extract(
-        body_scene(), body_surface(), measured(front_points()), MeshConfig(max_faces=3 * len(faces) // 2)
-    )
-    assert len(coarse.faces) == len(plain.faces) == len(faces)
-    assert len(fine.faces) == pytest.approx(2 * len(faces), rel=0.02)
-    assert as_trimesh(fine.vertices, fine.faces).is_watertight
-    assert np.abs(surface_distance(fine.vertices)).max() < 0.2 * body_surface().cell_world
-
-
 @pytest.mark.parametrize(("edge_confidence", "choice"), [(0.2, "closed smoothly"), (0.5, "cut off")])
 def test_only_sure_measurements_at_the_edges_open_a_scene(edge_confidence: float, choice: str) -> None:
     stereo = measured(floor_points(), edge_confidence=edge_confidence)

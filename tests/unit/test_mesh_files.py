@@ -15,8 +15,9 @@ from backend.mesh_files import (
     write_mesh,
     write_points,
     write_sparse,
+    write_texture,
 )
-from backend.scene import Region, SurfaceMesh, SurfacePoints
+from backend.scene import Region, SurfaceMesh, SurfacePoints, Texture
 
 
 def random_mesh(seed: int = 0, offset: float = 0.0) -> SurfaceMesh:
@@ -32,6 +33,21 @@ def random_mesh(seed: int = 0, offset: float = 0.0) -> SurfaceMesh:
     )
 
 
+def textured_mesh(seed: int = 0) -> SurfaceMesh:
+    """The same, each face with a place of its own in a random picture."""
+    mesh, random = random_mesh(seed), np.random.default_rng(seed)
+    places = random.uniform(0, [40, 30], (len(mesh.faces), 3, 2)).astype(np.float32)
+    picture = random.integers(0, 256, (30, 40, 3), np.uint8)
+    return replace(mesh, texture=Texture(image_srgb=picture, corners_px=places))
+
+
+def write_both(folder: Path, mesh: SurfaceMesh) -> Path:
+    assert mesh.texture is not None
+    write_mesh(folder / "mesh.ply", mesh)
+    write_texture(folder / "texture.png", mesh.texture)
+    return folder / "mesh.ply"
+
+
 def assert_same(found: SurfaceMesh, expected: SurfaceMesh) -> None:
     for name in ("vertices", "faces", "normals", "colours_srgb", "support"):
         ours, theirs = getattr(found, name), getattr(expected, name)
@@ -44,6 +60,66 @@ def test_a_mesh_comes_back_to_the_bit(tmp_path: Path, offset: float) -> None:
     mesh = random_mesh(offset=offset)
     write_mesh(tmp_path / "mesh.ply", mesh)
     assert_same(read_mesh(tmp_path / "mesh.ply"), mesh)
+
+
+def test_a_texture_comes_back(tmp_path: Path) -> None:
+    mesh = textured_mesh()
+    found = read_mesh(write_both(tmp_path, mesh))
+    assert_same(found, mesh)
+    assert found.texture is not None
+    assert mesh.texture is not None
+    np.testing.assert_array_equal(found.texture.image_srgb, mesh.texture.image_srgb)
+    np.testing.assert_allclose(found.texture.corners_px, mesh.texture.corners_px, atol=1e-4)
+
+
+@pytest.mark.parametrize("content", [None, b"", b"no picture"])
+def test_a_mesh_whose_texture_is_gone_or_damaged_is_refused(tmp_path: Path, content: bytes | None) -> None:
+    path = write_both(tmp_path, textured_mesh())
+    (tmp_path / "texture.png").unlink()
+    if content is not None:
+        (tmp_path / "texture.png").write_bytes(content)
+    with pytest.raises(MeshFileError, match=r"texture\.png is not beside the mesh"):
+        read_mesh(path)
+
+
+def test_another_reader_sees_the_same_texture(tmp_path: Path) -> None:
+    mesh = textured_mesh()
+    found = trimesh.load_mesh(write_both(tmp_path, mesh), process=False, fix_texture=True)
+    assert mesh.texture is not None
+    u, v = np.asarray(found.visual.uv)[found.faces].transpose(2, 0, 1)
+    np.testing.assert_allclose(np.stack([40 * u, 30 - 30 * v], axis=-1), mesh.texture.corners_px, atol=1e-4)
+    np.testing.assert_allclose(found.vertices[found.faces], mesh.vertices[mesh.faces])
+    np.testing.assert_array_equal(
+        np.asarray(found.visual.material.image.convert("RGB")), mesh.texture.image_srgb
+    )
+
+
+def test_glb_holds_the_texture_in_place_of_colours(tmp_path: Path) -> None:
+    mesh = textured_mesh()
+    write_glb(tmp_path / "mesh.glb", mesh)
+    assert mesh.texture is not None
+    (found,) = trimesh.load_scene(tmp_path / "mesh.glb", process=False).geometry.values()
+    x, y, z = mesh.vertices[mesh.faces].transpose(2, 0, 1)
+    np.testing.assert_allclose(found.vertices[found.faces], np.stack([x, z, -y], axis=-1), atol=1e-6)
+    u, v = np.asarray(found.visual.uv)[found.faces].transpose(2, 0, 1)
+    np.testing.assert_allclose(np.stack([40 * u, 30 - 30 * v], axis=-1), mesh.texture.corners_px, atol=1e-4)
+    image = found.visual.material.baseColorTexture
+    np.testing.assert_array_equal(np.asarray(image.convert("RGB")), mesh.texture.image_srgb)
+    assert "color" not in found.visual.vertex_attributes  # viewers multiply both
+    np.testing.assert_allclose(
+        found.vertex_attributes["_SUPPORT"].ravel()[found.faces], mesh.support[mesh.faces]
+    )
+
+
+def test_glb_has_two_vertices_in_place_of_one_only_where_charts_meet(tmp_path: Path) -> None:
+    mesh = random_mesh()
+    corners = mesh.vertices[mesh.faces][..., :2].astype(np.float32)
+    corners[mesh.faces.min(axis=1) == 0] += 5  # the faces around the first vertex are a chart of their own
+    picture = np.zeros((4, 4, 3), np.uint8)
+    write_glb(tmp_path / "mesh.glb", replace(mesh, texture=Texture(image_srgb=picture, corners_px=corners)))
+    (found,) = trimesh.load_scene(tmp_path / "mesh.glb", process=False).geometry.values()
+    around = (mesh.faces == 0).any(axis=1).sum()
+    assert len(found.vertices) == len(mesh.vertices) + around
 
 
 def test_an_empty_mesh_comes_back(tmp_path: Path) -> None:
@@ -122,7 +198,7 @@ def test_sparse_points_of_other_cameras_are_refused(tmp_path: Path) -> None:
 def test_the_same_mesh_gives_the_same_bytes(tmp_path: Path) -> None:
     for index in range(2):
         write_mesh(tmp_path / f"{index}.ply", random_mesh())
-        write_glb(tmp_path / f"{index}.glb", random_mesh())
+        write_glb(tmp_path / f"{index}.glb", textured_mesh())
     for kind in ("ply", "glb"):
         assert (tmp_path / f"0.{kind}").read_bytes() == (tmp_path / f"1.{kind}").read_bytes()
 

@@ -1,6 +1,7 @@
 """The add-on's PLY reader against the backend's writer, and against files that lie."""
 
 import os
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -8,10 +9,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from addon.ply import read_ply
+from addon.mesh_arrays import mesh_arrays
+from addon.ply import PlyMesh, read_ply
 from addon.ply import write_points as write_cloud
 from backend.mesh_files import write_mesh, write_points
-from backend.scene import Region, SurfaceMesh, SurfacePoints, to_unit_sphere
+from backend.scene import Region, SurfaceMesh, SurfacePoints, Texture, to_unit_sphere
 from backend.stages.point_cloud import read_cloud
 
 TRIANGLE = b"""ply
@@ -55,6 +57,35 @@ def test_it_reads_what_the_backend_writes(tmp_path: Path, num_vertices: int, num
     assert found.faces.dtype == np.int32
 
 
+def test_it_reads_where_faces_lie_in_a_texture(tmp_path: Path) -> None:
+    mesh = some_mesh(30, 50)
+    places = np.random.default_rng(1).uniform(0, 16, (50, 3, 2)).astype(np.float32)
+    picture = np.zeros((32, 16, 3), np.uint8)
+    write_mesh(tmp_path / "mesh.ply", replace(mesh, texture=Texture(image_srgb=picture, corners_px=places)))
+    found = read_ply(tmp_path / "mesh.ply")
+    np.testing.assert_array_equal(found.faces, mesh.faces)
+    assert found.coordinates is not None
+    # u to the right and v up, as Blender has them
+    np.testing.assert_allclose(found.coordinates[..., 0], places[..., 0] / 16, atol=1e-6)
+    np.testing.assert_allclose(found.coordinates[..., 1], 1 - places[..., 1] / 32, atol=1e-6)
+
+
+def test_faces_that_are_left_out_take_their_places_with_them() -> None:
+    faces = np.array([[0, 1, 2], [1, 1, 2], [2, 0, 1], [1, 2, 3]], np.int32)
+    mesh = PlyMesh(
+        positions=np.eye(4, 3),
+        faces=faces,
+        normals=None,
+        colours_srgb=None,
+        support=None,
+        coordinates=np.arange(24, dtype=np.float32).reshape(4, 3, 2),
+    )
+    found = mesh_arrays(mesh, np.eye(4))
+    assert found.corner_vertices.tolist() == [0, 1, 2, 1, 2, 3]
+    assert found.corner_coordinates is not None
+    np.testing.assert_array_equal(found.corner_coordinates.ravel(), [*range(6), *range(18, 24)])
+
+
 def test_it_reads_points(tmp_path: Path) -> None:
     mesh = some_mesh(50, 0)
     points = SurfacePoints(
@@ -94,6 +125,7 @@ def test_what_is_not_there_is_none(tmp_path: Path) -> None:
     assert found.normals is None
     assert found.colours_srgb is None
     assert found.support is None
+    assert found.coordinates is None
     assert found.faces.tolist() == [[0, 1, 2]]
 
 
@@ -108,6 +140,14 @@ def changed(old: bytes, new: bytes) -> bytes:
     return (TRIANGLE + CORNERS + FACE).replace(old, new)
 
 
+COORDINATES = b"property list uchar float texcoord\n"
+TEXTURED = (
+    TRIANGLE.replace(b"end_header", COORDINATES + b"end_header")
+    + CORNERS
+    + FACE
+    + b"\x06"
+    + np.full(6, 0.5, "<f4").tobytes()
+)
 NAN = np.array([np.nan], "<f4").tobytes()
 LYING = {
     "nothing": b"",
@@ -134,6 +174,12 @@ LYING = {
     "float colours": TRIANGLE.replace(b"float x\n", b"float x\nproperty float red\n") + b"\0" * 48 + FACE,
     "unknown type": changed(b"property float x", b"property quad x"),
     "list at vertices": changed(b"property float x", b"property list uchar int x"),
+    "coordinates of four corners": TEXTURED.replace(b"\x06", b"\x08"),
+    "coordinates that are no numbers": TEXTURED[:-4] + NAN,
+    "coordinates cut short": TEXTURED[:-4],
+    "coordinates as bytes": TEXTURED.replace(b"uchar float texcoord", b"uchar uchar texcoord"),
+    "coordinates alone": TEXTURED.replace(b"property list uchar int vertex_indices\n", b""),
+    "coordinates twice": TEXTURED.replace(COORDINATES, COORDINATES * 2),
     "faces with a second property": changed(b"end_header", b"property int material\nend_header"),
     "float corners": changed(b"uchar int vertex", b"uchar float vertex"),
     "quad": changed(b"\x03\0\0\0\0\x01", b"\x04\0\0\0\0\x01"),

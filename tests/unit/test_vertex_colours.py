@@ -42,8 +42,9 @@ def coloured(
     vertices, normals = np.asarray(mesh.vertices), true_normals(np.asarray(mesh.vertices))
     caster = RayCaster(vertices, np.asarray(mesh.faces))
     seen = visible_from(vertices, normals, [view.camera for view in views], caster)
-    colours, decision = colour_vertices(vertices, normals, seen, views, exposures_evened=exposures_evened)
-    return colours[seen.any(axis=1)] / 255.0, vertices[seen.any(axis=1)], decision
+    found = colour_vertices(vertices, normals, seen, views, exposures_evened=exposures_evened)
+    shown = seen.any(axis=1)
+    return found.colours_srgb[shown] / 255.0, vertices[shown], found.decision
 
 
 def test_photographs_exposed_alike_are_left_alone() -> None:
@@ -90,6 +91,7 @@ def test_without_a_photograph_that_shows_anything_nothing_is_divided_by_zero() -
     mesh = true_mesh()
     vertices, normals = np.asarray(mesh.vertices), true_normals(np.asarray(mesh.vertices))
     unseen = np.zeros((len(vertices), 3), bool)
-    colours, decision = colour_vertices(vertices, normals, unseen, body_views())
-    assert decision.choice == "left as it is"
-    assert not colours.any()
+    found = colour_vertices(vertices, normals, unseen, body_views())
+    assert found.decision.choice == "left as it is"
+    assert not found.log_exposures.any()
+    assert not found.colours_srgb.any()

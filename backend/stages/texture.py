@@ -1,0 +1,175 @@
+"""The texture: a picture of the surface, put together from the photographs.
+
+Each face lies in the picture as the photograph shows it that shows it largest, so that texels are its pixels;
+regions of one photograph stay in one piece, as Lempitsky and Ivanov, "Seamless mosaicing of image-based
+texture maps" (2007), cut a surface by its best view. The colour of a texel is the mean of all photographs
+that see the place, those that see it frontally first, in whichever it lies: there are no seams to even out.
+"""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float64, Int64, UInt8
+from scipy.ndimage import distance_transform_edt
+
+from ..maths.atlas import faces_at, packed, side_by_side, spread
+from ..maths.exposure import evened
+from ..maths.pieces import connected_pieces
+from ..maths.projection import projected
+from ..maths.raycast import RayHits, interpolate
+from ..scene import Camera, SurfaceMesh, Texture, View
+from .originals import Colours, Original, close_up, close_up_camera
+from .vertex_colours import frontal_share, on_subject
+
+_SPREAD_ROUNDS = 8
+"""How far a face asks its neighbours for the best photograph: fewer and smaller pieces without it."""
+_MARGIN_PX = 2
+"""Around a chart, so that what is drawn bilinearly sees nothing of the next."""
+_BLEED_PX = 16
+"""How far a chart's colours go on around it, for viewers that draw the texture smaller than it is."""
+_UNUSED_SRGB = np.full(3, 128, np.uint8)
+_GUESSED_DENSITY = 0.25
+"""Of surface that no photograph shows, as a share of the others': its colours are smooth."""
+_LAST_RESORT = 1e-3
+"""Weight of a photograph at the rim of what it sees, where it may be a pixel beside."""
+_STRIP = 2**18
+"""Texels at a time."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TextureConfig:
+    """How fine the texture may be."""
+
+    max_photo_px: int = 2048
+    """Photographs are read again, for their colours alone, until their longer side is this."""
+    max_side_px: int = 4096
+    """Of the texture. Its texels are as large as pixels of these photographs if there is room for that."""
+
+
+def paint(
+    mesh: SurfaceMesh,
+    seen: Bool[np.ndarray, "vertices views"],
+    views: tuple[View, ...],
+    originals: tuple[Original, ...] | None,
+    log_exposures: Float64[np.ndarray, "views 3"],
+    config: TextureConfig,
+) -> Texture:
+    """The texture of a mesh without one.
+
+    `seen` says which views see a vertex, `originals` what the views were made from, where they were made from
+    files, and `log_exposures` what their colours are brought together by.
+    Raises ReconstructionError(PHOTO_UNREADABLE).
+    """
+    pairs = list(zip(views, originals or [None] * len(views), strict=True))
+    cameras = [close_up_camera(view, original, config.max_photo_px) for view, original in pairs]
+    photographs = (close_up(view, original, config.max_photo_px) for view, original in pairs)
+    corners_px, (width, height) = _layout(mesh, seen, cameras, config.max_side_px)
+    covered, texels = faces_at(corners_px, width, height)
+    colours = np.zeros((height, width, 3), np.uint8)
+    colours[covered] = _colours(mesh, texels, seen, cameras, photographs, log_exposures)
+    away, nearest = distance_transform_edt(~covered, return_indices=True)
+    colours = np.where(away[..., None] <= _BLEED_PX, colours[tuple(nearest)], _UNUSED_SRGB)
+    return Texture(image_srgb=colours, corners_px=corners_px.astype(np.float32))
+
+
+def _layout(
+    mesh: SurfaceMesh, seen: Bool[np.ndarray, "vertices views"], cameras: Sequence[Camera], max_side_px: int
+) -> tuple[Float64[np.ndarray, "faces 3 2"], tuple[int, int]]:
+    """Corners of the faces in the picture, and its (width, height)."""
+    corners = mesh.vertices[mesh.faces]
+    area = np.linalg.norm(_across(corners), axis=1) / 2
+    pixels = np.stack([projected(mesh.vertices, camera)[0][mesh.faces] for camera in cameras])
+    density = np.zeros((len(mesh.faces), len(cameras)))
+    for index in range(len(cameras)):
+        shown = seen[mesh.faces, index].all(axis=1) & (area > 0)
+        density[shown, index] = _area_px(pixels[index][shown]) / area[shown]
+    pairs = side_by_side(mesh.faces)
+    best = np.where(density > 0, spread(density, pairs, _SPREAD_ROUNDS), 0.0)
+    picture, known = best.argmax(axis=1), best.any(axis=1)
+    laid = pixels[picture, np.arange(len(picture))]
+    if not known.all():
+        guessed = np.flatnonzero(~known)
+        axis, laid[guessed] = _from_outside(corners[guessed])
+        picture[guessed] = len(cameras) + axis
+        usual = np.sqrt(np.median(density.max(axis=1)[known])) if known.any() else 1.0
+        laid[guessed] *= _GUESSED_DENSITY * usual
+    same = picture[pairs[0]] == picture[pairs[1]]
+    return _placed(laid, connected_pieces(pairs[:, same], len(picture)), max_side_px)
+
+
+def _placed(
+    laid: Float64[np.ndarray, "faces 3 2"], chart: Int64[np.ndarray, "faces"], max_side_px: int
+) -> tuple[Float64[np.ndarray, "faces 3 2"], tuple[int, int]]:
+    """Charts side by side in one picture, drawn smaller where it would be too large; its (width, height)."""
+    scale = 1.0
+    while True:
+        low = np.full((chart.max() + 1, 2), np.inf)
+        high = -low
+        np.minimum.at(low, chart, scale * laid.min(axis=1))
+        np.maximum.at(high, chart, scale * laid.max(axis=1))
+        # by whole pixels, so that texels are pixels of the photograph
+        first = np.floor(low) - _MARGIN_PX
+        places, size = packed((np.ceil(high) + _MARGIN_PX - first).astype(np.int64))
+        if max(size) <= max_side_px or scale * np.ptp(laid, axis=(0, 1)).max() < 1:
+            return scale * laid + (places - first)[chart][:, None], size
+        scale *= min(0.95, max_side_px / max(size))
+
+
+def _across(corners: Float64[np.ndarray, "faces 3 3"]) -> Float64[np.ndarray, "faces 3"]:
+    return np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+
+
+def _area_px(corners: Float64[np.ndarray, "faces 3 2"]) -> Float64[np.ndarray, "faces"]:
+    (ax, ay), (bx, by) = (corners[:, 1] - corners[:, 0]).T, (corners[:, 2] - corners[:, 0]).T
+    return np.asarray(np.abs(ax * by - ay * bx) / 2)
+
+
+def _from_outside(
+    corners: Float64[np.ndarray, "faces 3 3"],
+) -> tuple[Int64[np.ndarray, "faces"], Float64[np.ndarray, "faces 3 2"]]:
+    """From which of the six sides of its box a face is seen best, and how it looks from there."""
+    across = _across(corners)
+    axis = np.abs(across).argmax(axis=1)
+    rows = np.arange(len(corners))
+    front = across[rows, axis] > 0
+    u, v = (np.moveaxis(corners, 2, 0)[(axis + step) % 3, rows] for step in (1, 2))
+    return axis + 3 * front, np.stack([u, v], axis=-1)
+
+
+def _colours(
+    mesh: SurfaceMesh,
+    texels: RayHits,
+    seen: Bool[np.ndarray, "vertices views"],
+    cameras: Sequence[Camera],
+    photographs: Iterable[Colours],
+    log_exposures: Float64[np.ndarray, "views 3"],
+) -> UInt8[np.ndarray, "texels 3"]:
+    """Means of the photographs; where none shows the place, the colours of the vertices."""
+    total = np.zeros((len(texels.face), 3), np.float32)
+    weight = np.zeros((len(texels.face), 1), np.float32)
+    for index, (camera, photograph) in enumerate(zip(cameras, photographs, strict=True)):
+        share = _shares(mesh, seen[:, index], camera)
+        shown = np.flatnonzero(seen[mesh.faces, index].all(axis=1)[texels.face])
+        for first in range(0, len(shown), _STRIP):
+            mine = shown[first : first + _STRIP]
+            corners, within = mesh.faces[texels.face[mine]], texels.barycentric[mine]
+            sampled = photograph(interpolate(mesh.vertices, corners, within))
+            counts = (interpolate(share, corners, within) + _LAST_RESORT) * on_subject(sampled[:, 3])
+            total[mine] += counts[:, None] * evened(sampled[:, :3], log_exposures[index])
+            weight[mine] += counts[:, None]
+    known = weight[:, 0] > 0
+    colours = np.zeros((len(known), 3), np.uint8)
+    colours[known] = np.clip(255 * total[known] / weight[known] + 0.5, 0, 255)
+    corners, within = mesh.faces[texels.face[~known]], texels.barycentric[~known]
+    colours[~known] = interpolate(mesh.colours_srgb, corners, within) + 0.5
+    return colours
+
+
+def _shares(
+    mesh: SurfaceMesh, seen: Bool[np.ndarray, "vertices"], camera: Camera
+) -> Float64[np.ndarray, "vertices"]:
+    """How much a photograph counts at each vertex: none where a neighbour is hidden, so that it fades out."""
+    inside = seen.copy()
+    inside[mesh.faces[~seen[mesh.faces].all(axis=1)]] = False
+    return np.where(inside, frontal_share(mesh.vertices, mesh.normals.astype(np.float64), camera), 0.0)
