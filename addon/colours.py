@@ -10,6 +10,7 @@ from typing import Literal
 import bpy
 import numpy as np
 
+from .camera_objects import ROLE
 from .heat_map import ERROR, SUPPORT, HeatMap, heat_colours
 
 COLOUR = "Color"
@@ -19,7 +20,8 @@ Kind = Literal["COLOUR", "SUPPORT", "ERROR"]
 _HEAT_MAPS: dict[Kind, HeatMap] = {"SUPPORT": SUPPORT, "ERROR": ERROR}
 UV_MAP = "FewView"
 """Name of the UV map of a result's texture."""
-_ATTRIBUTE_NODE, _TEXTURE_NODE = "FewView Colors", "FewView Texture"
+_ATTRIBUTE, _TEXTURE = "colours", "texture"
+"""Values of `fewview_role`, of the two nodes that a result's colours may come from."""
 _MISSING: dict[Kind, str] = {
     "COLOUR": "This mesh has no colors: import the result again",
     "SUPPORT": "This mesh does not know its support: import the result again",
@@ -39,7 +41,7 @@ def make_material(
     output = nodes.new("ShaderNodeOutputMaterial")
     surface = nodes.new("ShaderNodeBsdfPrincipled")
     colours = nodes.new("ShaderNodeVertexColor")
-    colours.layer_name, colours.name = "", _ATTRIBUTE_NODE
+    colours.layer_name, colours[ROLE] = "", _ATTRIBUTE
     surface.inputs["Roughness"].default_value = 1.0
     surface.inputs["Specular IOR Level"].default_value = 0.0
     links.new(colours.outputs["Color"], surface.inputs["Base Color"])
@@ -47,7 +49,7 @@ def make_material(
     surface.location, output.location, colours.location = (0, 0), (300, 0), (-220, 0)
     if texture is not None:
         picture = nodes.new("ShaderNodeTexImage")
-        picture.image, picture.name, picture.extension = texture, _TEXTURE_NODE, "EXTEND"
+        picture.image, picture.extension, picture[ROLE] = texture, "EXTEND", _TEXTURE
         where = nodes.new("ShaderNodeUVMap")
         where.uv_map = UV_MAP
         links.new(where.outputs["UV"], picture.inputs["Vector"])
@@ -104,8 +106,8 @@ def texture_or_none(mesh: bpy.types.Mesh) -> bpy.types.Image | None:
     """The picture of a mesh with a UV map for it."""
     if UV_MAP not in mesh.uv_layers:
         return None
-    found = (nodes[_TEXTURE_NODE].image for nodes in map(_nodes_or_none, mesh.materials) if nodes is not None)
-    return next((image for image in found if image is not None), None)
+    nodes = (_node_or_none(material, _TEXTURE) for material in mesh.materials)
+    return next((node.image for node in nodes if node is not None and node.image is not None), None)
 
 
 def show_in_viewports(mesh: bpy.types.Mesh) -> None:
@@ -121,22 +123,21 @@ def show_in_viewports(mesh: bpy.types.Mesh) -> None:
 
 def _choose_node(mesh: bpy.types.Mesh) -> None:
     """Connect the texture, or the colour attribute, in materials that still have both as they were made."""
-    name = _TEXTURE_NODE if shows_texture(mesh) else _ATTRIBUTE_NODE
     for material in mesh.materials:
-        nodes = _nodes_or_none(material)
-        if nodes is None:
+        picture, colours = _node_or_none(material, _TEXTURE), _node_or_none(material, _ATTRIBUTE)
+        if picture is None or colours is None:
             continue
+        wanted, other = (picture, colours) if shows_texture(mesh) else (colours, picture)
         for link in list(material.node_tree.links):
-            if link.from_node.name in (_ATTRIBUTE_NODE, _TEXTURE_NODE) and link.from_node.name != name:
-                material.node_tree.links.new(nodes[name].outputs["Color"], link.to_socket)
+            if link.from_node == other:
+                material.node_tree.links.new(wanted.outputs["Color"], link.to_socket)
 
 
-def _nodes_or_none(material: bpy.types.Material | None) -> bpy.types.Nodes | None:
-    """The nodes of a material that can show a texture or an attribute."""
+def _node_or_none(material: bpy.types.Material | None, role: str) -> bpy.types.Node | None:
+    """The node of a result's material with this value of `fewview_role`."""
     if material is None or material.node_tree is None:
         return None
-    nodes = material.node_tree.nodes
-    return nodes if _ATTRIBUTE_NODE in nodes and _TEXTURE_NODE in nodes else None
+    return next((node for node in material.node_tree.nodes if node.get(ROLE) == role), None)
 
 
 def _draw(mesh: bpy.types.Mesh, heat: HeatMap) -> str:

@@ -123,6 +123,7 @@ def _check_compiler() -> Check:
     """Fine if compiled code finds what is known; it is kept for later runs."""
     from .kernels.bending import error_of_a_constant
     from .kernels.cross_check import error_of_a_map_with_itself
+    from .kernels.face_drawing import error_of_a_half
     from .kernels.patch_correlation import error_of_an_image_with_itself
     from .kernels.plane_fits import error_of_a_plane
     from .kernels.ray_crossing import error_of_a_plane_ahead
@@ -133,6 +134,7 @@ def _check_compiler() -> Check:
         error_of_a_plane,
         error_of_a_map_with_itself,
         error_of_a_plane_ahead,
+        error_of_a_half,
     )
     started = time.perf_counter()
     error = max(error_of() for error_of in known)

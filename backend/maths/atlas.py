@@ -5,20 +5,32 @@ A chart is a connected part of the surface that is drawn in one piece. All lengt
 """
 
 import math
+from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
+import torch
 from jaxtyping import Bool, Float, Float64, Int64
 from scipy.sparse import coo_array
 
-from .raycast import RayCaster, RayHits
+from ..kernels.face_drawing import draw_faces
+from ..kernels.side_by_side import side_by_side
 
 _ROOM = 1.1
 """Area of the picture for the charts' boxes; what they need beyond its width makes it higher."""
-_STRIP_PX = 2**20
-"""Pixels that are looked up at a time."""
 
 
-def side_by_side(faces: Int64[np.ndarray, "faces 3"]) -> Int64[np.ndarray, "2 pairs"]:
+@dataclass(frozen=True, kw_only=True)
+class Texels:
+    """The pixels of a picture that belong to a mesh, row by row."""
+
+    covered: Bool[np.ndarray, "height width"]
+    face: Int64[np.ndarray, "texels"]
+    barycentric: Float64[np.ndarray, "texels 3"]
+    """Weights of the face's three corners at the pixel's centre, summing to 1."""
+
+
+def neighbours(faces: Int64[np.ndarray, "faces 3"]) -> Int64[np.ndarray, "2 pairs"]:
     """Pairs of faces that share an edge; where more than two do, the neighbours in their order."""
     ends = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
     order = np.lexsort((ends[:, 1], ends[:, 0]))
@@ -60,24 +72,14 @@ def packed(
     return corners, (width, y + shelf)
 
 
-def faces_at(
-    corners_px: Float[np.ndarray, "faces 3 2"], width: int, height: int
-) -> tuple[Bool[np.ndarray, "height width"], RayHits]:
-    """Which pixels' centres lie in a face, and in which, where: the hits of these, row by row.
-
-    Where faces overlap, one of them.
-    """
-    flat = np.zeros((corners_px.size // 2, 3))
-    flat[:, :2] = corners_px.reshape(-1, 2)
-    caster = RayCaster(flat, np.arange(len(flat)).reshape(-1, 3))
-    covered, strips = np.zeros((height, width), bool), []
-    rows = max(1, _STRIP_PX // width)
-    for top in range(0, height, rows):
-        y, x = np.mgrid[top : min(top + rows, height), :width] + 0.5
-        above = np.stack([x.ravel(), y.ravel(), np.ones(x.size)], axis=1)
-        hits = caster.cast(above, np.broadcast_to([0.0, 0.0, -1.0], above.shape))
-        covered[top : top + rows] = hits.hit.reshape(x.shape)
-        strips.append((hits.face[hits.hit], hits.barycentric[hits.hit]))
-    face = np.concatenate([face for face, _ in strips])
-    barycentric = np.concatenate([weights for _, weights in strips])
-    return covered, RayHits(distance=np.ones(len(face)), face=face, barycentric=barycentric)
+def faces_at(corners_px: Float[np.ndarray, "faces 3 2"], width: int, height: int) -> Texels:
+    """Which pixels' centres lie in a face, and in which; where faces overlap, in one of them."""
+    corners = np.ascontiguousarray(corners_px, np.float64)
+    face, weights = np.full((height, width), -1, np.int32), np.zeros((height, width, 2), np.float32)
+    threads = torch.get_num_threads()
+    ends = np.linspace(0, height, threads + 1).astype(int).tolist()
+    side_by_side(lambda rows: draw_faces(rows, corners, face, weights), list(pairwise(ends)), threads)
+    covered = face >= 0
+    first, second = weights[covered].T.astype(np.float64)
+    barycentric = np.stack([first, second, np.clip(1 - first - second, 0, 1)], axis=1)
+    return Texels(covered=covered, face=face[covered].astype(np.int64), barycentric=barycentric)

@@ -65,8 +65,9 @@ class MeshConfig:
     max_faces: int = 50_000
     smallest_piece: float = 0.02
     """Pieces with a smaller share of the largest one's area are dropped as floating."""
-    texture: TextureConfig | None = field(default_factory=TextureConfig)
-    """None for colours of vertices alone."""
+    textured: bool = True
+    """Whether colours are finer than the vertices."""
+    texture: TextureConfig = field(default_factory=TextureConfig)
     exposures_evened: bool = True
     """Whether photographs of other exposure or white balance are brought to the mean of all, for colour."""
 
@@ -117,7 +118,7 @@ def extract_mesh(
         support=support,
         decisions=(*decisions, coloured.decision),
     )
-    if config.texture is None:
+    if not config.textured:
         return mesh
     progress(0.7, "texture")
     texture = paint(mesh, seen, views, originals, coloured.log_exposures, config.texture)

@@ -13,11 +13,11 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int64, UInt8
 from scipy.ndimage import distance_transform_edt
 
-from ..maths.atlas import faces_at, packed, side_by_side, spread
+from ..maths.atlas import Texels, faces_at, neighbours, packed, spread
 from ..maths.exposure import evened
 from ..maths.pieces import connected_pieces
 from ..maths.projection import projected
-from ..maths.raycast import RayHits, interpolate
+from ..maths.raycast import interpolate
 from ..scene import Camera, SurfaceMesh, Texture, View
 from .originals import Colours, Original, close_up, close_up_camera
 from .vertex_colours import frontal_share, on_subject
@@ -65,10 +65,10 @@ def paint(
     cameras = [close_up_camera(view, original, config.max_photo_px) for view, original in pairs]
     photographs = (close_up(view, original, config.max_photo_px) for view, original in pairs)
     corners_px, (width, height) = _layout(mesh, seen, cameras, config.max_side_px)
-    covered, texels = faces_at(corners_px, width, height)
+    texels = faces_at(corners_px, width, height)
     colours = np.zeros((height, width, 3), np.uint8)
-    colours[covered] = _colours(mesh, texels, seen, cameras, photographs, log_exposures)
-    away, nearest = distance_transform_edt(~covered, return_indices=True)
+    colours[texels.covered] = _colours(mesh, texels, seen, cameras, photographs, log_exposures)
+    away, nearest = distance_transform_edt(~texels.covered, return_indices=True)
     colours = np.where(away[..., None] <= _BLEED_PX, colours[tuple(nearest)], _UNUSED_SRGB)
     return Texture(image_srgb=colours, corners_px=corners_px.astype(np.float32))
 
@@ -84,7 +84,7 @@ def _layout(
     for index in range(len(cameras)):
         shown = seen[mesh.faces, index].all(axis=1) & (area > 0)
         density[shown, index] = _area_px(pixels[index][shown]) / area[shown]
-    pairs = side_by_side(mesh.faces)
+    pairs = neighbours(mesh.faces)
     best = np.where(density > 0, spread(density, pairs, _SPREAD_ROUNDS), 0.0)
     picture, known = best.argmax(axis=1), best.any(axis=1)
     laid = pixels[picture, np.arange(len(picture))]
@@ -139,7 +139,7 @@ def _from_outside(
 
 def _colours(
     mesh: SurfaceMesh,
-    texels: RayHits,
+    texels: Texels,
     seen: Bool[np.ndarray, "vertices views"],
     cameras: Sequence[Camera],
     photographs: Iterable[Colours],

@@ -154,7 +154,7 @@ def ball() -> Surface:
     return Surface(distance=np.sqrt(x**2 + y**2 + z**2) - np.float32(0.5), grid_from_world=np.eye(4))
 
 
-def extract_mesh(*earlier: Any, progress: Progress) -> SurfaceMesh:
+def extract_mesh(*earlier: Any, originals: Any, progress: Progress) -> SurfaceMesh:
     work("mesh", progress)
     vertices = np.eye(3) * earlier[3].values
     return SurfaceMesh(

@@ -63,9 +63,9 @@ def texel_places(
 ) -> tuple[np.ndarray, Float64[np.ndarray, "texels 3"], Float64[np.ndarray, "texels 3"]]:
     """Face, place in the world and colour (0 to 1) of each texel that is one."""
     height, width = texture.image_srgb.shape[:2]
-    covered, hits = faces_at(texture.corners_px, width, height)
-    places = interpolate(mesh.vertices, mesh.faces[hits.face], hits.barycentric)
-    return hits.face, places, texture.image_srgb[covered] / 255.0
+    texels = faces_at(texture.corners_px, width, height)
+    places = interpolate(mesh.vertices, mesh.faces[texels.face], texels.barycentric)
+    return texels.face, places, texture.image_srgb[texels.covered] / 255.0
 
 
 def test_texels_have_the_colours_of_the_surface() -> None:
@@ -107,7 +107,7 @@ def test_faces_lie_apart_and_away_from_the_border() -> None:
     a, b, c = np.moveaxis(texture.corners_px.astype(np.float64), 1, 0)
     (abx, aby), (acx, acy) = (b - a).T, (c - a).T
     areas = np.abs(abx * acy - aby * acx) / 2
-    covered, _ = faces_at(texture.corners_px, width, height)
+    covered = faces_at(texture.corners_px, width, height).covered
     # faces on top of each other would cover less than their areas together
     assert covered.sum() == pytest.approx(areas.sum(), rel=0.005)
 
@@ -138,7 +138,7 @@ def test_what_is_beside_a_chart_is_like_it() -> None:
     """What is drawn between texels, or from afar, must not bring in another colour."""
     texture = painted()
     height, width = texture.image_srgb.shape[:2]
-    covered, _ = faces_at(texture.corners_px, width, height)
+    covered = faces_at(texture.corners_px, width, height).covered
     beside = ~covered[1:-1, 1:-1] & covered[1:-1, 2:]
     jump = np.abs(texture.image_srgb[1:-1, 1:-1].astype(int) - texture.image_srgb[1:-1, 2:])[beside]
     assert np.median(jump) == 0
