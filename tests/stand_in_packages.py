@@ -31,6 +31,7 @@ checks = {
     "patch_correlation": "error_of_an_image_with_itself",
     "plane_fits": "error_of_a_plane",
     "ray_crossing": "error_of_a_plane_ahead",
+    "face_drawing": "error_of_a_half",
 }
 for module, check in checks.items():
     compiled = sys.modules[f"backend.kernels.{module}"] = types.ModuleType(module)

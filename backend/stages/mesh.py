@@ -121,8 +121,8 @@ def extract_mesh(
     if not config.textured:
         return mesh
     progress(0.7, "texture")
-    texture = paint(mesh, seen, views, originals, coloured.log_exposures, config.texture)
-    return replace(mesh, texture=texture)
+    texture, decision = paint(mesh, seen, views, originals, coloured.log_exposures, config.texture)
+    return replace(mesh, texture=texture, decisions=(*mesh.decisions, decision))
 
 
 def preview_mesh(

@@ -18,7 +18,7 @@ from ..maths.exposure import evened
 from ..maths.pieces import connected_pieces
 from ..maths.projection import projected
 from ..maths.raycast import interpolate
-from ..scene import Camera, SurfaceMesh, Texture, View
+from ..scene import Camera, Decision, SurfaceMesh, Texture, View
 from .originals import Colours, Original, close_up, close_up_camera
 from .vertex_colours import frontal_share, on_subject
 
@@ -54,8 +54,8 @@ def paint(
     originals: tuple[Original, ...] | None,
     log_exposures: Float64[np.ndarray, "views 3"],
     config: TextureConfig,
-) -> Texture:
-    """The texture of a mesh without one.
+) -> tuple[Texture, Decision]:
+    """The texture of a mesh without one, and how large it is.
 
     `seen` says which views see a vertex, `originals` what the views were made from, where they were made from
     files, and `log_exposures` what their colours are brought together by.
@@ -64,19 +64,26 @@ def paint(
     pairs = list(zip(views, originals or [None] * len(views), strict=True))
     cameras = [close_up_camera(view, original, config.max_photo_px) for view, original in pairs]
     photographs = (close_up(view, original, config.max_photo_px) for view, original in pairs)
-    corners_px, (width, height) = _layout(mesh, seen, cameras, config.max_side_px)
+    corners_px, (width, height), scale = _layout(mesh, seen, cameras, config.max_side_px)
     texels = faces_at(corners_px, width, height)
     colours = np.zeros((height, width, 3), np.uint8)
     colours[texels.covered] = _colours(mesh, texels, seen, cameras, photographs, log_exposures)
     away, nearest = distance_transform_edt(~texels.covered, return_indices=True)
     colours = np.where(away[..., None] <= _BLEED_PX, colours[tuple(nearest)], _UNUSED_SRGB)
-    return Texture(image_srgb=colours, corners_px=corners_px.astype(np.float32))
+    longest = max(max(camera.width, camera.height) for camera in cameras)
+    decision = Decision(
+        what="texture",
+        choice=f"{width} x {height}",
+        because=f"{scale:.0%} of the size of photographs of up to {longest} pixels, the side at most "
+        f"{config.max_side_px}",
+    )
+    return Texture(image_srgb=colours, corners_px=corners_px.astype(np.float32)), decision
 
 
 def _layout(
     mesh: SurfaceMesh, seen: Bool[np.ndarray, "vertices views"], cameras: Sequence[Camera], max_side_px: int
-) -> tuple[Float64[np.ndarray, "faces 3 2"], tuple[int, int]]:
-    """Corners of the faces in the picture, and its (width, height)."""
+) -> tuple[Float64[np.ndarray, "faces 3 2"], tuple[int, int], float]:
+    """Corners of the faces in the picture, its (width, height), and its scale, 1 for the photographs'."""
     corners = mesh.vertices[mesh.faces]
     area = np.linalg.norm(_across(corners), axis=1) / 2
     pixels = np.stack([projected(mesh.vertices, camera)[0][mesh.faces] for camera in cameras])
@@ -100,8 +107,8 @@ def _layout(
 
 def _placed(
     laid: Float64[np.ndarray, "faces 3 2"], chart: Int64[np.ndarray, "faces"], max_side_px: int
-) -> tuple[Float64[np.ndarray, "faces 3 2"], tuple[int, int]]:
-    """Charts side by side in one picture, drawn smaller where it would be too large; its (width, height)."""
+) -> tuple[Float64[np.ndarray, "faces 3 2"], tuple[int, int], float]:
+    """Charts side by side in one picture, drawn smaller where it would be too large."""
     scale = 1.0
     while True:
         low = np.full((chart.max() + 1, 2), np.inf)
@@ -112,7 +119,7 @@ def _placed(
         first = np.floor(low) - _MARGIN_PX
         places, size = packed((np.ceil(high) + _MARGIN_PX - first).astype(np.int64))
         if max(size) <= max_side_px or scale * np.ptp(laid, axis=(0, 1)).max() < 1:
-            return scale * laid + (places - first)[chart][:, None], size
+            return scale * laid + (places - first)[chart][:, None], size, scale
         scale *= min(0.95, max_side_px / max(size))
 
 

@@ -10,9 +10,11 @@ from jaxtyping import Float64
 from backend.maths.atlas import faces_at
 from backend.maths.exposure import evened
 from backend.maths.metrics import psnr
+from backend.maths.pieces import connected_pieces
 from backend.maths.projection import projected
 from backend.maths.raycast import RayCaster, interpolate, render_mesh, visible_from
-from backend.scene import SurfaceMesh, Texture, View
+from backend.scene import Camera, SurfaceMesh, Texture, View
+from backend.stages import texture as stage
 from backend.stages.mesh import simplified, vertex_normals
 from backend.stages.texture import TextureConfig, paint
 from tests.synthetic_scene import arc_cameras, photographed, texture_srgb, true_mesh
@@ -55,7 +57,8 @@ def painted(
     given, mesh = given or views(), mesh or body()
     none = np.zeros((len(given), 3))
     exposures = none if log_exposures is None else log_exposures
-    return paint(mesh, seen_by(mesh, given), given, None, exposures, TextureConfig(max_side_px=max_side_px))
+    config = TextureConfig(max_side_px=max_side_px)
+    return paint(mesh, seen_by(mesh, given), given, None, exposures, config)[0]
 
 
 def texel_places(
@@ -187,7 +190,92 @@ def test_the_same_photographs_give_the_same_texture() -> None:
 
 def test_a_mesh_that_no_photograph_shows_is_laid_out_all_the_same() -> None:
     unseen, config = np.zeros((len(body().vertices), 3), bool), TextureConfig(max_side_px=512)
-    texture = paint(body(), unseen, views(), None, np.zeros((3, 3)), config)
+    texture, decision = paint(body(), unseen, views(), None, np.zeros((3, 3)), config)
+    height, width = texture.image_srgb.shape[:2]
+    assert (decision.what, decision.choice) == ("texture", f"{width} x {height}")
     assert max(texture.image_srgb.shape[:2]) <= 512
     _, _, colours = texel_places(texture, body())
     np.testing.assert_array_equal(colours, np.broadcast_to(MARKER / 255, colours.shape))
+
+
+def plane(cells: int = 20) -> SurfaceMesh:
+    """A square in y = 0, 2 wide, that faces -y, as a grid."""
+    x, z = np.meshgrid(np.linspace(-1, 1, cells + 1), np.linspace(-1, 1, cells + 1))
+    corner = np.arange((cells + 1) * cells).reshape(cells, cells + 1)[:, :-1].ravel()
+    halves = ([0, 1, cells + 2], [0, cells + 2, cells + 1])
+    count = (cells + 1) ** 2
+    return SurfaceMesh(
+        vertices=np.stack([x.ravel(), np.zeros(count), z.ravel()], axis=-1),
+        faces=np.concatenate([corner[:, None] + half for half in halves]),
+        normals=np.tile(np.float32([0, -1, 0]), (count, 1)),
+        colours_srgb=np.tile(MARKER, (count, 1)),
+        support=np.zeros(count, np.float32),
+    )
+
+
+def facing_the_plane(x: float, grey: float) -> View:
+    """A photograph of one grey, taken from (x, -4, 0)."""
+    camera = Camera(
+        camera_from_world=np.array([[1, 0, 0, -x], [0, 0, -1, 0], [0, 1, 0, 4], [0, 0, 0, 1]], np.float64),
+        fx_px=400.0,
+        fy_px=400.0,
+        cx_px=160.0,
+        cy_px=160.0,
+        width=320,
+        height=320,
+    )
+    return View(
+        name=f"{x}.png", camera=camera, image_srgb=np.full((320, 320, 3), grey, np.float32), mask=None
+    )
+
+
+def test_where_something_hides_a_photograph_it_ends_without_a_step() -> None:
+    mesh, given = plane(), (facing_the_plane(-0.1, 0.2), facing_the_plane(0.1, 0.8))
+    seen = np.ones((len(mesh.vertices), 2), bool)
+    seen[mesh.vertices[:, 0] > 0.001, 1] = False
+    texture, _ = paint(mesh, seen, given, None, np.zeros((2, 3)), TextureConfig())
+    drawn = render_mesh(replace(mesh, texture=texture), facing_the_plane(0, 0).camera).colour_srgb[
+        160, 80:240
+    ]
+    middle, one = drawn[:60, 0].mean(), drawn[100:, 0].mean()
+    assert middle == pytest.approx(0.5, abs=0.02)
+    assert one == pytest.approx(0.2, abs=0.01)
+    assert np.abs(np.diff(drawn[5:-5, 0])).max() < 0.06  # the whole 0.3 over a cell of ten pixels
+
+
+def num_charts(texture: Texture, mesh: SurfaceMesh) -> int:
+    """Pieces in which faces share corners of the surface at one place of the texture."""
+    keys = np.column_stack([mesh.faces.ravel(), np.round(texture.corners_px.reshape(-1, 2) * 16)])
+    _, corner = np.unique(keys, axis=0, return_inverse=True)
+    corner = corner.reshape(-1, 3)
+    pairs = np.concatenate([corner[:, :2], corner[:, 1:]]).T
+    return len(np.unique(connected_pieces(pairs, int(corner.max()) + 1)))
+
+
+def test_faces_ask_their_neighbours_for_the_best_photograph(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked = num_charts(painted(), body())
+    monkeypatch.setattr(stage, "_SPREAD_ROUNDS", 0)
+    assert asked < 0.8 * num_charts(painted(), body())
+
+
+@pytest.mark.parametrize(("mask", "counts"), [(0.45, False), (0.55, True)])
+def test_pixels_that_are_half_off_the_subject_do_not_count(mask: float, counts: bool) -> None:
+    view = facing_the_plane(0, 0.5)
+    given = (replace(view, mask=np.full((320, 320), mask, np.float32)),)
+    mesh = plane()
+    seen = np.ones((len(mesh.vertices), 1), bool)
+    texture, _ = paint(mesh, seen, given, None, np.zeros((1, 3)), TextureConfig())
+    _, _, colours = texel_places(texture, mesh)
+    expected = np.full(3, 128) if counts else MARKER
+    np.testing.assert_allclose(255 * colours, np.broadcast_to(expected, colours.shape), atol=1)
+
+
+def test_a_texture_finer_than_the_picture_is_drawn_as_its_mean() -> None:
+    mesh = plane(1)
+    fine = np.zeros((512, 512, 3), np.uint8)
+    fine[::2, ::2] = fine[1::2, 1::2] = 200  # a chequerboard of single texels
+    corners = 256 + 255 * mesh.vertices[mesh.faces][..., [0, 2]] * [1, -1]
+    textured = replace(mesh, texture=Texture(image_srgb=fine, corners_px=corners.astype(np.float32)))
+    camera = facing_the_plane(0, 0).camera.resized(80, 80)
+    drawn = render_mesh(textured, camera)
+    assert drawn.colour_srgb[drawn.coverage] == pytest.approx(100 / 255, abs=0.05)
