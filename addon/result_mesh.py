@@ -123,7 +123,9 @@ def _write_obj(name: str, *, texture: bpy.types.Image | None) -> None:
         bpy.ops.wm.obj_export(filepath=name, export_selected_objects=True, export_colors=True)
         return
     beside = _free_name(Path(name))
-    texture.save(filepath=str(beside), save_copy=True)
+    if texture.is_dirty or texture.packed_file is None:  # painted on, or unpacked
+        texture.pack()
+    beside.write_bytes(texture.packed_file.data)
     before, texture.filepath = texture.filepath, str(beside)
     try:
         bpy.ops.wm.obj_export(filepath=name, export_selected_objects=True, path_mode="STRIP")
