@@ -8,8 +8,8 @@ import numpy as np
 from scipy.ndimage import gaussian_filter
 from scipy.spatial.transform import Rotation
 
+from backend.maths.bilinear import bilinear
 from backend.scene import Photo
-from backend.stages.lenses import sampled
 
 WIDTH, HEIGHT, FOCAL_PX = 400, 300, 420.0
 SLOPE = 0.8
@@ -57,8 +57,9 @@ def render(camera_from_world: np.ndarray, slope: float = SLOPE, focal_px: float 
         nearest = np.where(valid, np.minimum(nearest, distance), nearest)
     hit = origin + np.where(np.isfinite(nearest), nearest, 0.0)[..., None] * rays
     along = hit[..., 0] * math.hypot(1, slope)
-    grey = sampled(texture(), np.stack([512 + 190 * along, 512 + 190 * hit[..., 1]], axis=-1))
-    return np.repeat(grey[..., None], 3, axis=2)
+    places = np.stack([512 + 190 * along, 512 + 190 * hit[..., 1]], axis=-1)
+    grey = bilinear(texture()[..., None], places).astype(np.float32)
+    return np.repeat(grey, 3, axis=2)
 
 
 def make_photo(name: str, image: np.ndarray, focal_px: float | None = None) -> Photo:

@@ -1,22 +1,20 @@
 """Colours of a picture between its pixels, and over several of them."""
 
+from functools import partial
+
 import numpy as np
 from jaxtyping import Float, Float64, Shaped
+from scipy.ndimage import map_coordinates
 
 
 def bilinear(
-    image: Shaped[np.ndarray, "height width channels"], pixels: Float[np.ndarray, "points 2"]
-) -> Float64[np.ndarray, "points channels"]:
+    image: Shaped[np.ndarray, "height width channels"], pixels: Float[np.ndarray, "*places 2"]
+) -> Float64[np.ndarray, "*places channels"]:
     """Values at places (x, y), in pixels; beyond the border the nearest pixel counts."""
-    height, width = image.shape[:2]
-    place = np.clip(pixels - 0.5, 0, [width - 1, height - 1])
-    left, top = np.floor(place).astype(np.intp).T
-    right, below = np.minimum(left + 1, width - 1), np.minimum(top + 1, height - 1)
-    s, t = (place - np.stack([left, top], axis=1)).T[..., None]
-    flat = image.reshape(height * width, -1)
-    upper = flat[top * width + left] * (1 - s) + flat[top * width + right] * s
-    lower = flat[below * width + left] * (1 - s) + flat[below * width + right] * s
-    return np.asarray(upper * (1 - t) + lower * t)
+    places = np.stack([pixels[..., 1], pixels[..., 0]]) - 0.5
+    channels = np.moveaxis(image, -1, 0)
+    read = partial(map_coordinates, coordinates=places, output=np.float64, order=1, mode="nearest")
+    return np.stack([read(channel) for channel in channels], axis=-1)
 
 
 def shrunk(

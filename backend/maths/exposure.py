@@ -32,12 +32,12 @@ def log_exposures(
 
 
 def evened(
-    srgb: Float64[np.ndarray, "points 3"], log_exposure: Float64[np.ndarray, "3"]
-) -> Float64[np.ndarray, "points 3"]:
-    """Colours of a photograph as they were without its exposure; the same where that is 0."""
+    srgb: Float64[np.ndarray, "*views points 3"], log_exposure: Float64[np.ndarray, "*views 3"]
+) -> Float64[np.ndarray, "*views points 3"]:
+    """Colours of photographs as they were without their exposures; the same where these are 0."""
     if not log_exposure.any():
         return srgb
-    return srgb_from_linear(linear_from_srgb(srgb) * np.exp(-log_exposure))
+    return srgb_from_linear(linear_from_srgb(srgb) * np.exp(-log_exposure)[..., None, :])
 
 
 def disagreement(

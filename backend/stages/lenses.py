@@ -12,10 +12,10 @@ from types import MappingProxyType
 import numpy as np
 import PIL.Image  # noqa: F401 - pycolmap loaded before Pillow corrupts memory when Pillow next saves
 import pycolmap
-from jaxtyping import Bool, Float, Float32, Float64
-from scipy.ndimage import map_coordinates
+from jaxtyping import Bool, Float64
 
 from ..errors import ErrorCode, ReconstructionError
+from ..maths.bilinear import bilinear
 from ..scene import Camera, CameraEvidence, Decision, Lens, Photo, Unplaced, View
 
 SMALLEST_ZOOM, LARGEST_ZOOM = 0.5, 4.0
@@ -107,8 +107,9 @@ def undistorted_view(photo: Photo, placed: PlacedPhoto) -> View:
     if is_pinhole(lens):
         return View(name=photo.name, camera=camera, image_srgb=photo.image_srgb, mask=photo.mask)
     sources = source_pixels(lens, camera)
-    mask = None if photo.mask is None else sampled(photo.mask, sources)
-    return View(name=photo.name, camera=camera, image_srgb=sampled(photo.image_srgb, sources), mask=mask)
+    image = bilinear(photo.image_srgb, sources).astype(np.float32)
+    mask = None if photo.mask is None else bilinear(photo.mask[..., None], sources)[..., 0].astype(np.float32)
+    return View(name=photo.name, camera=camera, image_srgb=image, mask=mask)
 
 
 def photo_lens(photo: Photo, placed: PlacedPhoto) -> Lens:
@@ -199,20 +200,6 @@ def source_pixels(lens: pycolmap.Camera, camera: Camera) -> Float64[np.ndarray, 
     )
     image_points: Float64[np.ndarray, "pixels 2"] = lens.img_from_cam(rays.reshape(-1, 3))
     return image_points.reshape(camera.height, camera.width, 2)
-
-
-def sampled(
-    image: Float32[np.ndarray, "height width *channels"],
-    image_points: Float[np.ndarray, "new_height new_width 2"],
-) -> Float32[np.ndarray, "new_height new_width *channels"]:
-    """Bilinear samples at points (x, y) in pixels; beyond the border its nearest pixel."""
-    coordinates = np.stack([image_points[..., 1], image_points[..., 0]]) - 0.5
-    if image.ndim == 2:
-        plane: Float32[np.ndarray, "new_height new_width"]
-        plane = map_coordinates(image, coordinates, order=1, mode="nearest")
-        return plane
-    channels = [sampled(image[..., index], image_points) for index in range(image.shape[2])]
-    return np.stack(channels, axis=-1)
 
 
 def _bisected_zoom(lens: pycolmap.Camera, too_small: float, filled: float) -> float:

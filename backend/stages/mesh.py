@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float32, Float64, Int64
 from skimage.measure import marching_cubes
 
 from ..errors import ErrorCode, ReconstructionError
+from ..maths.faces import area_vectors, face_areas
 from ..maths.grid import near_surface, refined, spacing
 from ..maths.nearest import nearest_tree
 from ..maths.pieces import connected_pieces
@@ -39,11 +40,6 @@ Vertices = Float64[np.ndarray, "vertices 3"]
 Faces = Int64[np.ndarray, "faces 3"]
 KeptVertices = Float64[np.ndarray, "kept_vertices 3"]
 KeptFaces = Int64[np.ndarray, "kept_faces 3"]
-_Backing = tuple[
-    Float64[np.ndarray, "vertices 3"], Bool[np.ndarray, "vertices views"], Float32[np.ndarray, "vertices"]
-]
-"""Normals, which views see a vertex, and its support."""
-
 
 MEASURED_EDGES = 0.03
 """Share of the pictures' edges. Measured: 0 to 0.001 for objects, 0.06 to 0.5 for facades and floors."""
@@ -91,15 +87,10 @@ def extract_mesh(
     progress(0.4, "support")
     points = transform_points(region.world_from_object, stereo.points.positions.astype(np.float64))
     cell = surface.cell_world
-    cameras = [view.camera for view in views]
-
-    def backing(vertices: Vertices, faces: Faces) -> _Backing:
-        normals = vertex_normals(vertices, faces)
-        seen = visible_from(vertices, normals, cameras, RayCaster(vertices, faces))
-        return normals, seen, support_of(vertices, seen, points, stereo.points.confidence, cell)
-
+    normals = vertex_normals(vertices, faces)
+    seen = visible_from(vertices, normals, [view.camera for view in views], RayCaster(vertices, faces))
+    support = support_of(vertices, seen, points, stereo.points.confidence, cell)
     decisions: tuple[Decision, ...] = ()
-    normals, seen, support = backing(vertices, faces)
     kept = in_seen_pieces(faces, seen)
     if len(points) and all(view.mask is None for view in views):
         measured_scene, decision = _open_or_closed(vertices, faces, support, stereo.depth_maps, cell)
@@ -190,12 +181,6 @@ def level_set(surface: Surface) -> tuple[Vertices, Faces]:
     return transform_points(world_from_grid, vertices.astype(np.float64) - 1), faces.astype(np.int64)
 
 
-def face_areas(vertices: Vertices, faces: Faces) -> Float64[np.ndarray, "faces"]:
-    """Area of every face."""
-    a, b, c = (vertices[faces[:, k]] for k in range(3))
-    return np.asarray(np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2)
-
-
 def without_small_pieces(vertices: Vertices, faces: Faces, smallest: float) -> KeptFaces:
     """Faces of the connected pieces whose area is at least a share of the largest piece's."""
     piece = _piece_of_faces(faces, len(vertices))
@@ -270,8 +255,7 @@ def without_short_edges(vertices: Vertices, faces: Faces, shortest: float) -> Ke
 
 def vertex_normals(vertices: Vertices, faces: Faces) -> Float64[np.ndarray, "vertices 3"]:
     """Unit normals, the mean of the faces around weighted by their area."""
-    a, b, c = (vertices[faces[:, k]] for k in range(3))
-    across = np.cross(b - a, c - a)
+    across = area_vectors(vertices, faces)
     normals = np.stack(
         [
             np.bincount(faces.ravel(), weights=np.repeat(across[:, axis], 3), minlength=len(vertices))

@@ -15,6 +15,7 @@ from scipy.ndimage import distance_transform_edt
 
 from ..maths.atlas import Texels, faces_at, neighbours, packed, spread
 from ..maths.exposure import evened
+from ..maths.faces import area_vectors, face_areas
 from ..maths.pieces import connected_pieces
 from ..maths.projection import projected
 from ..maths.raycast import interpolate
@@ -64,10 +65,11 @@ def paint(
     pairs = list(zip(views, originals or [None] * len(views), strict=True))
     cameras = [close_up_camera(view, original, config.max_photo_px) for view, original in pairs]
     photographs = (close_up(view, original, config.max_photo_px) for view, original in pairs)
-    corners_px, (width, height), scale = _layout(mesh, seen, cameras, config.max_side_px)
+    shown = seen[mesh.faces].all(axis=1)
+    corners_px, (width, height), scale = _layout(mesh, shown, cameras, config.max_side_px)
     texels = faces_at(corners_px, width, height)
     colours = np.zeros((height, width, 3), np.uint8)
-    colours[texels.covered] = _colours(mesh, texels, seen, cameras, photographs, log_exposures)
+    colours[texels.covered] = _colours(mesh, texels, shown, cameras, photographs, log_exposures)
     away, nearest = distance_transform_edt(~texels.covered, return_indices=True)
     colours = np.where(away[..., None] <= _BLEED_PX, colours[tuple(nearest)], _UNUSED_SRGB)
     longest = max(max(camera.width, camera.height) for camera in cameras)
@@ -81,23 +83,22 @@ def paint(
 
 
 def _layout(
-    mesh: SurfaceMesh, seen: Bool[np.ndarray, "vertices views"], cameras: Sequence[Camera], max_side_px: int
+    mesh: SurfaceMesh, shown: Bool[np.ndarray, "faces views"], cameras: Sequence[Camera], max_side_px: int
 ) -> tuple[Float64[np.ndarray, "faces 3 2"], tuple[int, int], float]:
     """Corners of the faces in the picture, its (width, height), and its scale, 1 for the photographs'."""
-    corners = mesh.vertices[mesh.faces]
-    area = np.linalg.norm(_across(corners), axis=1) / 2
+    area = face_areas(mesh.vertices, mesh.faces)
     pixels = np.stack([projected(mesh.vertices, camera)[0][mesh.faces] for camera in cameras])
     density = np.zeros((len(mesh.faces), len(cameras)))
     for index in range(len(cameras)):
-        shown = seen[mesh.faces, index].all(axis=1) & (area > 0)
-        density[shown, index] = _area_px(pixels[index][shown]) / area[shown]
+        mine = shown[:, index] & (area > 0)
+        density[mine, index] = _area_px(pixels[index][mine]) / area[mine]
     pairs = neighbours(mesh.faces)
     best = np.where(density > 0, spread(density, pairs, _SPREAD_ROUNDS), 0.0)
     picture, known = best.argmax(axis=1), best.any(axis=1)
     laid = pixels[picture, np.arange(len(picture))]
     if not known.all():
         guessed = np.flatnonzero(~known)
-        axis, laid[guessed] = _from_outside(corners[guessed])
+        axis, laid[guessed] = _from_outside(mesh.vertices, mesh.faces[guessed])
         picture[guessed] = len(cameras) + axis
         usual = np.sqrt(np.median(density.max(axis=1)[known])) if known.any() else 1.0
         laid[guessed] *= _GUESSED_DENSITY * usual
@@ -123,31 +124,26 @@ def _placed(
         scale *= min(0.95, max_side_px / max(size))
 
 
-def _across(corners: Float64[np.ndarray, "faces 3 3"]) -> Float64[np.ndarray, "faces 3"]:
-    return np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-
-
 def _area_px(corners: Float64[np.ndarray, "faces 3 2"]) -> Float64[np.ndarray, "faces"]:
     (ax, ay), (bx, by) = (corners[:, 1] - corners[:, 0]).T, (corners[:, 2] - corners[:, 0]).T
     return np.asarray(np.abs(ax * by - ay * bx) / 2)
 
 
 def _from_outside(
-    corners: Float64[np.ndarray, "faces 3 3"],
+    vertices: Float64[np.ndarray, "vertices 3"], faces: Int64[np.ndarray, "faces 3"]
 ) -> tuple[Int64[np.ndarray, "faces"], Float64[np.ndarray, "faces 3 2"]]:
     """From which of the six sides of its box a face is seen best, and how it looks from there."""
-    across = _across(corners)
+    across = area_vectors(vertices, faces)
     axis = np.abs(across).argmax(axis=1)
-    rows = np.arange(len(corners))
-    front = across[rows, axis] > 0
-    u, v = (np.moveaxis(corners, 2, 0)[(axis + step) % 3, rows] for step in (1, 2))
+    front = across[np.arange(len(faces)), axis] > 0
+    u, v = (vertices[faces, (axis[:, None] + step) % 3] for step in (1, 2))
     return axis + 3 * front, np.stack([u, v], axis=-1)
 
 
 def _colours(
     mesh: SurfaceMesh,
     texels: Texels,
-    seen: Bool[np.ndarray, "vertices views"],
+    shown: Bool[np.ndarray, "faces views"],
     cameras: Sequence[Camera],
     photographs: Iterable[Colours],
     log_exposures: Float64[np.ndarray, "views 3"],
@@ -156,10 +152,10 @@ def _colours(
     total = np.zeros((len(texels.face), 3), np.float32)
     weight = np.zeros((len(texels.face), 1), np.float32)
     for index, (camera, photograph) in enumerate(zip(cameras, photographs, strict=True)):
-        share = _shares(mesh, seen[:, index], camera)
-        shown = np.flatnonzero(seen[mesh.faces, index].all(axis=1)[texels.face])
-        for first in range(0, len(shown), _STRIP):
-            mine = shown[first : first + _STRIP]
+        share = _shares(mesh, shown[:, index], camera)
+        all_mine = np.flatnonzero(shown[texels.face, index])
+        for first in range(0, len(all_mine), _STRIP):
+            mine = all_mine[first : first + _STRIP]
             corners, within = mesh.faces[texels.face[mine]], texels.barycentric[mine]
             sampled = photograph(interpolate(mesh.vertices, corners, within))
             counts = (interpolate(share, corners, within) + _LAST_RESORT) * on_subject(sampled[:, 3])
@@ -174,9 +170,9 @@ def _colours(
 
 
 def _shares(
-    mesh: SurfaceMesh, seen: Bool[np.ndarray, "vertices"], camera: Camera
+    mesh: SurfaceMesh, shown: Bool[np.ndarray, "faces"], camera: Camera
 ) -> Float64[np.ndarray, "vertices"]:
     """How much a photograph counts at each vertex: none where a neighbour is hidden, so that it fades out."""
-    inside = seen.copy()
-    inside[mesh.faces[~seen[mesh.faces].all(axis=1)]] = False
+    inside = np.ones(len(mesh.vertices), bool)
+    inside[mesh.faces[~shown]] = False
     return np.where(inside, frontal_share(mesh.vertices, mesh.normals.astype(np.float64), camera), 0.0)

@@ -58,7 +58,7 @@ def colour_vertices(
         share[index, mine] = frontal * on_subject(sampled[:, 3])
         srgb[index, mine] = sampled[:, :3]
     exposures, decision = _exposures(srgb, share) if exposures_evened else _not_asked(len(views))
-    srgb = np.stack([evened(shown, by) for shown, by in zip(srgb, exposures, strict=True)])
+    srgb = evened(srgb, exposures)
     weight = share.sum(axis=0)
     known = weight > 0
     colours = (share[..., None] * srgb).sum(axis=0) / np.where(known, weight, 1.0)[:, None]

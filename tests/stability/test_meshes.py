@@ -10,7 +10,8 @@ import trimesh
 from skimage.measure import marching_cubes
 
 from backend.errors import ErrorCode, ReconstructionError
-from backend.stages.mesh import face_areas, level_set, simplified, without_short_edges
+from backend.maths.faces import face_areas
+from backend.stages.mesh import level_set, simplified, without_short_edges
 from backend.stages.surface import Surface
 from tests.stability.sweep import Sweep, check
 

@@ -9,6 +9,7 @@ import pytest
 import trimesh
 
 from backend.errors import ErrorCode, ReconstructionError
+from backend.maths.faces import face_areas
 from backend.maths.raycast import render_mesh
 from backend.scene import (
     DepthMap,
@@ -22,7 +23,6 @@ from backend.scene import (
 from backend.stages.mesh import (
     MeshConfig,
     extract_mesh,
-    face_areas,
     in_seen_pieces,
     level_set,
     only_used,
