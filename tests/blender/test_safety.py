@@ -461,12 +461,26 @@ def test_in_a_translated_blender(rehearsal: Rehearsal) -> None:
     for node in material.node_tree.nodes:
         node.name = f"übersetzt {node.bl_idname}"  # as some translations name them
     kinds = {node.bl_idname for node in material.node_tree.nodes}
-    assert kinds == {"ShaderNodeOutputMaterial", "ShaderNodeBsdfPrincipled", "ShaderNodeVertexColor"}
-    assert len(material.node_tree.links) == 2
+    assert kinds == {
+        "ShaderNodeOutputMaterial",
+        "ShaderNodeBsdfPrincipled",
+        "ShaderNodeVertexColor",
+        "ShaderNodeTexImage",
+        "ShaderNodeUVMap",
+    }
+
+    def colour_comes_from() -> str:
+        (link,) = (link for link in material.node_tree.links if link.from_socket.type == "RGBA")
+        return link.from_node.bl_idname
+
+    assert len(material.node_tree.links) == 3
+    assert colour_comes_from() == "ShaderNodeTexImage"
     assert bpy.ops.fewview.show_support() == {"FINISHED"}
     assert result.data.color_attributes.active_color.name != "Color"
+    assert colour_comes_from() == "ShaderNodeVertexColor"
     assert bpy.ops.fewview.show_colour() == {"FINISHED"}
     assert result.data.color_attributes.active_color.name == "Color"
+    assert colour_comes_from() == "ShaderNodeTexImage"
     # Its own words stay as they are: Blender translates labels where it draws them.
     assert bpy.ops.fewview.add_region() == {"FINISHED"}
 
