@@ -122,6 +122,7 @@ def _check_package(module: str, distribution: str) -> Check:
 def _check_compiler() -> Check:
     """Fine if compiled code finds what is known; it is kept for later runs."""
     from .kernels.bending import error_of_a_constant
+    from .kernels.bilinear_reading import error_of_a_slope
     from .kernels.cross_check import error_of_a_map_with_itself
     from .kernels.face_drawing import error_of_a_half
     from .kernels.patch_correlation import error_of_an_image_with_itself
@@ -135,6 +136,7 @@ def _check_compiler() -> Check:
         error_of_a_map_with_itself,
         error_of_a_plane_ahead,
         error_of_a_half,
+        error_of_a_slope,
     )
     started = time.perf_counter()
     error = max(error_of() for error_of in known)

@@ -32,6 +32,7 @@ checks = {
     "plane_fits": "error_of_a_plane",
     "ray_crossing": "error_of_a_plane_ahead",
     "face_drawing": "error_of_a_half",
+    "bilinear_reading": "error_of_a_slope",
 }
 for module, check in checks.items():
     compiled = sys.modules[f"backend.kernels.{module}"] = types.ModuleType(module)

@@ -10,7 +10,7 @@ from itertools import pairwise
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Float64, Int64
+from jaxtyping import Bool, Float, Float32, Float64, Int32, Int64
 from scipy.sparse import coo_array
 
 from ..kernels.face_drawing import draw_faces
@@ -25,9 +25,16 @@ class Texels:
     """The pixels of a picture that belong to a mesh, row by row."""
 
     covered: Bool[np.ndarray, "height width"]
-    face: Int64[np.ndarray, "texels"]
-    barycentric: Float64[np.ndarray, "texels 3"]
-    """Weights of the face's three corners at the pixel's centre, summing to 1."""
+    face: Int32[np.ndarray, "texels"]
+    weights: Float32[np.ndarray, "texels 2"]
+    """Of the face's first two corners at the pixel's centre; what is left of 1 is the third's."""
+
+    def barycentric(
+        self, which: Bool[np.ndarray, "texels"] | Int64[np.ndarray, "some"] | slice = slice(None)
+    ) -> Float64[np.ndarray, "some 3"]:
+        """Weights of all three corners of some texels, summing to 1."""
+        first, second = self.weights[which].T.astype(np.float64)
+        return np.stack([first, second, np.clip(1 - first - second, 0, 1)], axis=1)
 
 
 def neighbours(faces: Int64[np.ndarray, "faces 3"]) -> Int64[np.ndarray, "2 pairs"]:
@@ -80,6 +87,4 @@ def faces_at(corners_px: Float[np.ndarray, "faces 3 2"], width: int, height: int
     ends = np.linspace(0, height, threads + 1).astype(int).tolist()
     side_by_side(lambda rows: draw_faces(rows, corners, face, weights), list(pairwise(ends)), threads)
     covered = face >= 0
-    first, second = weights[covered].T.astype(np.float64)
-    barycentric = np.stack([first, second, np.clip(1 - first - second, 0, 1)], axis=1)
-    return Texels(covered=covered, face=face[covered].astype(np.int64), barycentric=barycentric)
+    return Texels(covered=covered, face=face[covered], weights=weights[covered])

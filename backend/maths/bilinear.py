@@ -1,20 +1,19 @@
 """Colours of a picture between its pixels, and over several of them."""
 
-from functools import partial
-
 import numpy as np
 from jaxtyping import Float, Float64, Shaped
-from scipy.ndimage import map_coordinates
+
+from ..kernels.bilinear_reading import read_bilinear
 
 
 def bilinear(
     image: Shaped[np.ndarray, "height width channels"], pixels: Float[np.ndarray, "*places 2"]
 ) -> Float64[np.ndarray, "*places channels"]:
     """Values at places (x, y), in pixels; beyond the border the nearest pixel counts."""
-    places = np.stack([pixels[..., 1], pixels[..., 0]]) - 0.5
-    channels = np.moveaxis(image, -1, 0)
-    read = partial(map_coordinates, coordinates=places, output=np.float64, order=1, mode="nearest")
-    return np.stack([read(channel) for channel in channels], axis=-1)
+    values = np.empty((*pixels.shape[:-1], image.shape[-1]))
+    flat = np.ascontiguousarray(pixels.reshape(-1, 2), np.float64)
+    read_bilinear(np.ascontiguousarray(image), flat, values.reshape(-1, image.shape[-1]))
+    return values
 
 
 def shrunk(

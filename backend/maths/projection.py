@@ -11,9 +11,13 @@ def projected(
 ) -> tuple[Float64[np.ndarray, "points 2"], Float64[np.ndarray, "points"]]:
     """Pixels and depths of points (world frame); pixels mean something where the depth is > 0."""
     in_camera = transform_points(camera.camera_from_world, points)
-    depth = in_camera[:, 2]
-    homogeneous = in_camera @ camera.intrinsics.T
-    return homogeneous[:, :2] / np.where(depth > 0, depth, 1.0)[:, None], depth
+    return in_pixels(in_camera, camera), in_camera[:, 2]
+
+
+def in_pixels(in_camera: Float[np.ndarray, "points 3"], camera: Camera) -> Float64[np.ndarray, "points 2"]:
+    """Pixels of points in the camera's axes; they mean something where z > 0."""
+    depth, homogeneous = in_camera[:, 2:], in_camera @ camera.intrinsics.T
+    return np.asarray(homogeneous[:, :2] / np.where(depth > 0, depth, 1.0))
 
 
 def in_picture(points: Float[np.ndarray, "points 3"], camera: Camera) -> Bool[np.ndarray, "points"]:

@@ -5,9 +5,9 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Bool, Float64, UInt8
 
-from ..scene import View
+from ..scene import View, transform_points
 from .bilinear import bilinear
-from .projection import in_picture, projected
+from .projection import in_picture, in_pixels
 
 _UNSEEN_GREY = 128
 
@@ -17,7 +17,14 @@ def colours_at(view: View, points: Float64[np.ndarray, "points 3"]) -> Float64[n
 
     The points lie in front of the camera; beyond the border the nearest pixel counts.
     """
-    pixels, _ = projected(points, view.camera)
+    return colours_in_camera(view, transform_points(view.camera.camera_from_world, points))
+
+
+def colours_in_camera(
+    view: View, in_camera: Float64[np.ndarray, "points 3"]
+) -> Float64[np.ndarray, "points 4"]:
+    """The same of points in the camera's axes."""
+    pixels = in_pixels(in_camera, view.camera)
     return np.column_stack([bilinear(view.image_srgb, pixels), mask_at(view, pixels)])
 
 

@@ -10,13 +10,13 @@ from jaxtyping import Float64
 
 from ..images import fitted_size, read_image
 from ..maths.bilinear import bilinear
-from ..maths.projection import projected
-from ..maths.sampling import colours_at, mask_at
-from ..scene import Camera, Lens, View, transform_points
+from ..maths.projection import in_pixels
+from ..maths.sampling import colours_in_camera, mask_at
+from ..scene import Camera, Lens, View
 from .lenses import colmap_lens, rescaled_lens
 
 Colours = Callable[[Float64[np.ndarray, "points 3"]], Float64[np.ndarray, "points 4"]]
-"""sRGB (0 to 1) and mask of a photograph where it shows points, world frame, in front of its camera."""
+"""sRGB (0 to 1) and mask of a photograph where it shows points in its camera's axes, in front of it."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,12 +43,12 @@ def close_up(view: View, original: Original | None, max_side_px: int) -> Colours
     """
     camera = close_up_camera(view, original, max_side_px)
     if original is None or camera is view.camera:
-        return partial(colours_at, view)
+        return partial(colours_in_camera, view)
     image = read_image(original.path, max_side_px).image_srgb
     lens = rescaled_lens(colmap_lens(original.lens), image.shape[1], image.shape[0])
 
-    def colours(points: Float64[np.ndarray, "points 3"]) -> Float64[np.ndarray, "points 4"]:
-        in_file = lens.img_from_cam(transform_points(view.camera.camera_from_world, points))
-        return np.column_stack([bilinear(image, in_file), mask_at(view, projected(points, view.camera)[0])])
+    def colours(in_camera: Float64[np.ndarray, "points 3"]) -> Float64[np.ndarray, "points 4"]:
+        in_file = lens.img_from_cam(in_camera)
+        return np.column_stack([bilinear(image, in_file), mask_at(view, in_pixels(in_camera, view.camera))])
 
     return colours

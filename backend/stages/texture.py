@@ -10,16 +10,18 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float64, Int64, UInt8
+import torch
+from jaxtyping import Bool, Float32, Float64, Int64, UInt8
 from scipy.ndimage import distance_transform_edt
 
+from ..kernels.side_by_side import bands_side_by_side, side_by_side
 from ..maths.atlas import Texels, faces_at, neighbours, packed, spread
 from ..maths.exposure import evened
 from ..maths.faces import area_vectors, face_areas
 from ..maths.pieces import connected_pieces
 from ..maths.projection import projected
 from ..maths.raycast import interpolate
-from ..scene import Camera, Decision, SurfaceMesh, Texture, View
+from ..scene import Camera, Decision, SurfaceMesh, Texture, View, transform_points
 from .originals import Colours, Original, close_up, close_up_camera
 from .vertex_colours import frontal_share, on_subject
 
@@ -34,8 +36,8 @@ _GUESSED_DENSITY = 0.25
 """Of surface that no photograph shows, as a share of the others': its colours are smooth."""
 _LAST_RESORT = 1e-3
 """Weight of a photograph at the rim of what it sees, where it may be a pixel beside."""
-_STRIP = 2**18
-"""Texels at a time."""
+_STRIP = 2**14
+"""Texels at a time: what is read and made of them stays in a cache."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -70,8 +72,7 @@ def paint(
     texels = faces_at(corners_px, width, height)
     colours = np.zeros((height, width, 3), np.uint8)
     colours[texels.covered] = _colours(mesh, texels, shown, cameras, photographs, log_exposures)
-    away, nearest = distance_transform_edt(~texels.covered, return_indices=True)
-    colours = np.where(away[..., None] <= _BLEED_PX, colours[tuple(nearest)], _UNUSED_SRGB)
+    bleed(colours, texels.covered)
     longest = max(max(camera.width, camera.height) for camera in cameras)
     decision = Decision(
         what="texture",
@@ -149,24 +150,60 @@ def _colours(
     log_exposures: Float64[np.ndarray, "views 3"],
 ) -> UInt8[np.ndarray, "texels 3"]:
     """Means of the photographs; where none shows the place, the colours of the vertices."""
-    total = np.zeros((len(texels.face), 3), np.float32)
-    weight = np.zeros((len(texels.face), 1), np.float32)
+    total = np.zeros((len(texels.face), 4), np.float32)
     for index, (camera, photograph) in enumerate(zip(cameras, photographs, strict=True)):
-        share = _shares(mesh, shown[:, index], camera)
-        all_mine = np.flatnonzero(shown[texels.face, index])
-        for first in range(0, len(all_mine), _STRIP):
-            mine = all_mine[first : first + _STRIP]
-            corners, within = mesh.faces[texels.face[mine]], texels.barycentric[mine]
-            sampled = photograph(interpolate(mesh.vertices, corners, within))
-            counts = (interpolate(share, corners, within) + _LAST_RESORT) * on_subject(sampled[:, 3])
-            total[mine] += counts[:, None] * evened(sampled[:, :3], log_exposures[index])
-            weight[mine] += counts[:, None]
-    known = weight[:, 0] > 0
+        in_camera = transform_points(camera.camera_from_world, mesh.vertices)
+        told = np.column_stack([in_camera, _shares(mesh, shown[:, index], camera)])
+        mine = np.flatnonzero(shown[texels.face, index])
+        _add(total, mesh.faces, texels, mine, told, photograph, log_exposures[index])
+    known = total[:, 3] > 0
     colours = np.zeros((len(known), 3), np.uint8)
-    colours[known] = np.clip(255 * total[known] / weight[known] + 0.5, 0, 255)
-    corners, within = mesh.faces[texels.face[~known]], texels.barycentric[~known]
+    colours[known] = np.clip(255 * total[known, :3] / total[known, 3:] + 0.5, 0, 255)
+    corners, within = mesh.faces[texels.face[~known]], texels.barycentric(~known)
     colours[~known] = interpolate(mesh.colours_srgb, corners, within) + 0.5
     return colours
+
+
+def _add(
+    total: Float32[np.ndarray, "texels 4"],
+    faces: Int64[np.ndarray, "faces 3"],
+    texels: Texels,
+    mine: Int64[np.ndarray, "some_texels"],
+    told: Float64[np.ndarray, "vertices 4"],
+    photograph: Colours,
+    log_exposure: Float64[np.ndarray, "3"],
+) -> None:
+    """Add the colours of a photograph times their weights, and these, where it shows the texels.
+
+    `told` of each vertex are its place in the camera's axes and how much the photograph counts there.
+    """
+
+    def add(strip: Int64[np.ndarray, "strip"]) -> None:
+        at = interpolate(told, faces[texels.face[strip]], texels.barycentric(strip))
+        sampled = photograph(at[:, :3])
+        weight = (at[:, 3:] + _LAST_RESORT) * on_subject(sampled[:, 3:])
+        total[strip, :3] += weight * evened(sampled[:, :3], log_exposure)
+        total[strip, 3:] += weight
+
+    strips = np.split(mine, range(_STRIP, len(mine), _STRIP))
+    side_by_side(add, strips, torch.get_num_threads())
+
+
+def bleed(colours: UInt8[np.ndarray, "height width 3"], covered: Bool[np.ndarray, "height width"]) -> None:
+    """Write colours where no chart is: near one those of its nearest texel, elsewhere a grey."""
+
+    def band(rows: tuple[int, int]) -> None:
+        first, end = rows
+        top = max(first - _BLEED_PX, 0)
+        around, free = slice(top, end + _BLEED_PX), ~covered[first:end]
+        colours[first:end][free] = _UNUSED_SRGB
+        if covered[around].any():
+            away, nearest = distance_transform_edt(~covered[around], return_indices=True)
+            away, nearest = away[first - top : end - top], nearest[:, first - top : end - top]
+            near = free & (away <= _BLEED_PX)
+            colours[first:end][near] = colours[around][tuple(nearest[:, near])]
+
+    bands_side_by_side(band, len(covered), torch.get_num_threads())
 
 
 def _shares(

@@ -71,7 +71,7 @@ def colour_vertices(
     return VertexColours(colours_srgb=rounded, log_exposures=exposures, decision=decision)
 
 
-def on_subject(mask: Float64[np.ndarray, "places"]) -> Float64[np.ndarray, "places"]:
+def on_subject(mask: Float64[np.ndarray, "*places"]) -> Float64[np.ndarray, "*places"]:
     """How much a pixel counts by its mask: half off the subject, it has half the backdrop's colour."""
     return np.where(mask > 0.5, mask**4, 0.0)
 

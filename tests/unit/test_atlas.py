@@ -70,7 +70,7 @@ def test_each_pixel_knows_its_face_and_where_in_it() -> None:
     covered = hits.covered
     y, x = np.nonzero(covered)
     centres = np.stack([x, y], axis=-1) + 0.5
-    found = np.einsum("hk,hkd->hd", hits.barycentric, corners[hits.face])
+    found = np.einsum("hk,hkd->hd", hits.barycentric(), corners[hits.face])
     np.testing.assert_allclose(found, centres, atol=1e-5)
     assert covered[2:22, 2:30].all()
     assert np.bincount(hits.face) == pytest.approx([280, 280, 28], rel=0.06)
@@ -90,7 +90,7 @@ def test_it_is_what_rays_through_the_flat_faces_find() -> None:
     hits = RayCaster(flat, np.arange(6).reshape(-1, 3)).cast(above, down)
     np.testing.assert_array_equal(found.covered.ravel(), hits.hit)
     np.testing.assert_array_equal(found.face, hits.face[hits.hit])
-    np.testing.assert_allclose(found.barycentric, hits.barycentric[hits.hit], atol=1e-5)
+    np.testing.assert_allclose(found.barycentric(), hits.barycentric[hits.hit], atol=1e-5)
 
 
 @pytest.mark.parametrize("threads", [1, 3])

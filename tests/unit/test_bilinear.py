@@ -35,6 +35,22 @@ def test_a_picture_of_one_pixel_is_that_everywhere() -> None:
     np.testing.assert_array_equal(bilinear(one, np.array([[0.0, 0.0], [0.5, 3.0]])), np.full((2, 3), 7.0))
 
 
+@pytest.mark.parametrize("place", [(np.nan, 2.5), (3.5, np.nan), (np.inf, -np.inf), (1e300, 1e300)])
+def test_a_place_that_is_nowhere_is_read_from_within_the_picture(place: tuple[float, float]) -> None:
+    values = bilinear(picture(), np.array([place]))
+    assert picture().min() <= values.min() <= values.max() <= picture().max()
+
+
+def test_pixels_of_any_kind_and_places_of_any_shape_are_read() -> None:
+    places = np.random.default_rng(0).uniform(0, 4, (3, 2, 4))[:, ::-1, ::2]  # with gaps in memory
+    image = np.arange(24, dtype=np.uint8).reshape(4, 2, 3).swapaxes(0, 1)
+    found = bilinear(image, places)
+    assert found.shape == (3, 2, 3)
+    for kind in (np.float32, np.float64):
+        np.testing.assert_allclose(bilinear(image.astype(kind), places), found)
+    np.testing.assert_allclose(bilinear(image, places.reshape(-1, 2)), found.reshape(-1, 3))
+
+
 @pytest.mark.parametrize("times", [1, 2, 3, 10])
 def test_a_smaller_picture_has_the_means(times: int) -> None:
     image = np.random.default_rng(0).integers(0, 256, (5, 7, 3), np.uint8)

@@ -7,10 +7,13 @@ import pytest
 from PIL import Image
 
 from backend.errors import ErrorCode, ReconstructionError
+from backend.maths.atlas import faces_at
+from backend.maths.raycast import interpolate
 from backend.maths.sampling import colours_at
-from backend.scene import Camera, Lens, View
+from backend.scene import Camera, Lens, SurfaceMesh, View
 from backend.stages.lenses import colmap_lens
 from backend.stages.originals import Original, close_up, close_up_camera
+from backend.stages.texture import TextureConfig, paint
 
 WIDTH, HEIGHT, FOCAL_PX = 600, 400, 520.0
 DISTANCE = 2.0
@@ -72,11 +75,23 @@ def test_places_are_found_through_the_lens(tmp_path: Path, model: str) -> None:
 
 def test_the_view_says_where_the_photograph_was_taken(tmp_path: Path) -> None:
     """Cameras may have been refined since; the lens has not."""
-    original = photographed(tmp_path / "wall.png", lens_of("PINHOLE"))
     moved = np.eye(4)
     moved[0, 3] = 0.01  # 2.6 pixels of the file: half a stripe
-    found = close_up(small_view(moved), original, 2048)(places() - [0.01, 0, 0])
-    assert np.abs(found[:, :3] - wall_srgb(*places()[:, :2].T)).max() < 0.12
+    corners = np.array([[-0.8, -0.5], [0.8, -0.5], [0.8, 0.5], [-0.8, 0.5]])
+    wall = SurfaceMesh(
+        vertices=np.column_stack([corners, np.full(4, DISTANCE)]) - [0.01, 0, 0],
+        faces=np.array([[0, 2, 1], [0, 3, 2]]),
+        normals=np.tile(np.float32([0, 0, -1]), (4, 1)),
+        colours_srgb=np.zeros((4, 3), np.uint8),
+        support=np.ones(4, np.float32),
+    )
+    views, original = (small_view(moved),), photographed(tmp_path / "wall.png", lens_of("PINHOLE"))
+    seen, alike = np.ones((4, 1), bool), np.zeros((1, 3))
+    texture, _ = paint(wall, seen, views, (original,), alike, TextureConfig())
+    texels = faces_at(texture.corners_px, *texture.image_srgb.shape[1::-1])
+    places = interpolate(wall.vertices, wall.faces[texels.face], texels.barycentric())
+    expected = wall_srgb(places[:, 0] + 0.01, places[:, 1])
+    assert np.abs(texture.image_srgb[texels.covered] / 255 - expected).max() < 0.12
 
 
 def test_the_file_is_read_at_the_size_that_is_asked_for(tmp_path: Path) -> None:

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from jaxtyping import Float64
 
+from backend.kernels.side_by_side import BAND
 from backend.maths.atlas import faces_at
 from backend.maths.exposure import evened
 from backend.maths.metrics import psnr
@@ -16,7 +17,7 @@ from backend.maths.raycast import RayCaster, interpolate, render_mesh, visible_f
 from backend.scene import Camera, SurfaceMesh, Texture, View
 from backend.stages import texture as stage
 from backend.stages.mesh import simplified, vertex_normals
-from backend.stages.texture import TextureConfig, paint
+from backend.stages.texture import TextureConfig, bleed, paint
 from tests.synthetic_scene import arc_cameras, photographed, texture_srgb, true_mesh
 
 MARKER = np.array([255, 0, 255], np.uint8)
@@ -67,7 +68,7 @@ def texel_places(
     """Face, place in the world and colour (0 to 1) of each texel that is one."""
     height, width = texture.image_srgb.shape[:2]
     texels = faces_at(texture.corners_px, width, height)
-    places = interpolate(mesh.vertices, mesh.faces[texels.face], texels.barycentric)
+    places = interpolate(mesh.vertices, mesh.faces[texels.face], texels.barycentric())
     return texels.face, places, texture.image_srgb[texels.covered] / 255.0
 
 
@@ -145,6 +146,24 @@ def test_what_is_beside_a_chart_is_like_it() -> None:
     beside = ~covered[1:-1, 1:-1] & covered[1:-1, 2:]
     jump = np.abs(texture.image_srgb[1:-1, 1:-1].astype(int) - texture.image_srgb[1:-1, 2:])[beside]
     assert np.median(jump) == 0
+
+
+def test_colours_go_on_from_the_nearest_texel_as_if_the_picture_were_one_piece() -> None:
+    rng = np.random.default_rng(0)
+    height, width = 3 * BAND + 5, 90  # the last rows' nearest texels lie beyond their own
+    covered = rng.random((height, width)) < 0.002
+    covered[: BAND + 40] &= rng.random((BAND + 40, 1)) < 0.02  # whole bands without any
+    colours = rng.integers(0, 256, (height, width, 3)).astype(np.uint8)
+    colours[~covered] = 0
+    found = colours.copy()
+    bleed(found, covered)
+    np.testing.assert_array_equal(found[covered], colours[covered])
+    texels = np.argwhere(covered)
+    for place in np.argwhere(~covered)[::7]:
+        away = np.linalg.norm(texels - place, axis=1)
+        of_nearest = colours[tuple(texels[np.isclose(away, away.min())].T)]
+        expected = of_nearest if away.min() <= 16 else np.full((1, 3), 128)
+        assert (expected == found[tuple(place)]).all(axis=1).any()
 
 
 def test_photographs_are_brought_to_one_exposure() -> None:
