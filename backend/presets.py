@@ -57,14 +57,20 @@ PRESETS = MappingProxyType(
                 free_leverage=1.2,
             ),
             train=TrainConfig(
-                levels=(32, 64, 96), rounds=(10, 10, 5), looks=(0, 3, 2), linear=LinearConfig(settled=0.01)
+                levels=(32, 64, 96),
+                rounds=(10, 10, 5),
+                looks=(0, 3, 2),
+                detail=0,
+                linear=LinearConfig(settled=0.01),
             ),
             mesh=MeshConfig(max_faces=25_000, texture=TextureConfig(max_photo_px=1600)),
         ),
         "balanced": Settings(photos=PhotosConfig(max_side_px=1024)),
         "detailed": Settings(
             photos=PhotosConfig(max_side_px=1600),
-            train=TrainConfig(levels=(32, 64, 128, 192), rounds=(15, 15, 10, 10), steps=(0, 0, 0, 200)),
+            train=TrainConfig(
+                levels=(32, 64, 128, 192), rounds=(15, 15, 10, 10), steps=(0, 0, 0, 200), detail=384
+            ),
             mesh=MeshConfig(max_faces=200_000, texture=TextureConfig(max_photo_px=4096, max_side_px=8192)),
         ),
         "nerf": Settings(photos=PhotosConfig(max_side_px=800), stereo=None, train=RadianceConfig()),

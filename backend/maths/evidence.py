@@ -5,6 +5,7 @@ q; every point says so to the nodes around it, and the nodes take the mean. A no
 photograph sees through it: in front of what was measured there, or off the subject's silhouette.
 """
 
+import math
 from dataclasses import dataclass
 
 import torch
@@ -19,6 +20,8 @@ _BATCH = 8192
 """Points whose distances to all nodes around them are computed at once: few enough for a core's cache."""
 _BEYOND = 3
 """Nodes around the grid that points at its border speak to; nobody reads them."""
+_ENOUGH_SHARED = 100
+"""Cubes in which two views say something, for their median to mean anything."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -82,9 +85,7 @@ def merged_points(
     """
     if not len(positions):
         return positions, normals, confidence
-    axis = normals.abs().argmax(dim=-1)
-    side = 2 * axis + (normals.gather(-1, axis[:, None])[:, 0] > 0)
-    cubes, cube_of = torch.unique(cube_keys(positions, cell) * 6 + side, return_inverse=True)
+    cubes, cube_of = torch.unique(_faced_cubes(positions, normals, cell), return_inverse=True)
     one = torch.ones_like(confidence)
     weighted = torch.column_stack([positions, normals, one, confidence]) * confidence[:, None]
     sums = positions.new_zeros((len(cubes), 8)).index_add_(0, cube_of, weighted)
@@ -97,6 +98,41 @@ def merged_points(
     )
 
 
+def scatter_between(
+    positions: Float[Tensor, "points 3"],
+    normals: Float[Tensor, "points 3"],
+    confidence: Float[Tensor, "points"],
+    views: Int64[Tensor, "points"],
+    cell: float,
+) -> float:
+    """How far apart two views put the same surface, in the median over cubes of side `cell`.
+
+    Along the normals, between the means of what each view says: at most about a cell. Infinite where hardly
+    any two say anything.
+    """
+    if not len(positions):
+        return math.inf
+    keys = _faced_cubes(positions, normals, cell) * (views.max() + 1) + views
+    groups, group_of = torch.unique(keys, return_inverse=True)
+    weighted = torch.column_stack([positions, normals, torch.ones_like(confidence)]) * confidence[:, None]
+    sums = positions.new_zeros((len(groups), 7)).index_add_(0, group_of, weighted)
+    place, normal = sums[:, :3] / sums[:, 6:], F.normalize(sums[:, 3:6], dim=-1)
+    cube = groups // (views.max() + 1)
+    shared = (cube[1:] == cube[:-1]) & (sums[1:, 6] > 0) & (sums[:-1, 6] > 0)
+    along = F.normalize(normal[1:] + normal[:-1], dim=-1)[shared]
+    apart = ((place[1:] - place[:-1])[shared] * along).sum(dim=-1).abs()
+    return float(apart.median()) if len(apart) >= _ENOUGH_SHARED else math.inf
+
+
+def _faced_cubes(
+    positions: Float[Tensor, "points 3"], normals: Float[Tensor, "points 3"], cell: float
+) -> Int64[Tensor, "points"]:
+    """A number for the cube that a point lies in, and the side of a die that it faces."""
+    axis = normals.abs().argmax(dim=-1)
+    side = 2 * axis + (normals.gather(-1, axis[:, None])[:, 0] > 0)
+    return cube_keys(positions, cell) * 6 + side
+
+
 def cube_keys(positions: Float[Tensor, "points 3"], cell: float) -> Int64[Tensor, "points"]:
     """A number for the cube, of side `cell`, that a point lies in; of at least one point."""
     place = (positions / cell).floor().long()
@@ -105,9 +141,14 @@ def cube_keys(positions: Float[Tensor, "points 3"], cell: float) -> Int64[Tensor
     return (place[:, 0] * size[1] + place[:, 1]) * size[2] + place[:, 2]
 
 
+def cell_px(camera: Pinhole, nodes: int) -> float:
+    """About a cell of the grid in pixels of a photograph, at the grid's middle."""
+    return float(spacing(nodes) * camera.intrinsics[0, 0] / camera.position.norm())
+
+
 def half_cell_px(camera: Pinhole, nodes: int) -> int:
-    """About half a cell of the grid in pixels of a photograph, at the grid's middle; at least 1."""
-    return max(1, round(float(spacing(nodes) * camera.intrinsics[0, 0] / camera.position.norm()) / 2))
+    """Half of that in whole pixels; at least 1."""
+    return max(1, round(cell_px(camera, nodes) / 2))
 
 
 def _offsets(first: int, last: int, device: torch.device) -> Int[Tensor, "offsets 3"]:

@@ -99,7 +99,7 @@ def for_textured(config: LinearConfig) -> LinearConfig:
 
 def weight_beside(told: ShownPlaces, scene: Measurements, config: LinearConfig) -> float:
     """Of what brightness `told`, beside what stereo measured; infinite where that is nothing."""
-    told_weight, measured = config.brightness * told.weights.sum(), _stereo_weights(scene, config).sum()
+    told_weight, measured = config.brightness * told.weights.sum(), stereo_weights(scene, config).sum()
     return float(told_weight / measured) if measured > 0 else math.inf
 
 
@@ -152,7 +152,7 @@ def fit_level(
             if (shown := ask(distance)) is None:
                 looks = 0
             else:
-                measured = _near_nodes(_points(scene, config, h / 2, shown), nodes, config)
+                measured = points_near_nodes(scene, config, nodes, shown)
                 bridges = _before_hidden(shown, nodes) & (measured.weight < _HARDLY_MEASURED)
         target, weight = before, torch.full_like(before, config.prior * (32 / nodes) ** 2)
         for where, least, strength in (
@@ -181,12 +181,19 @@ def fit_level(
     return distance
 
 
+def points_near_nodes(
+    scene: Measurements, config: LinearConfig, nodes: int, shown: ShownPlaces | None = None
+) -> PointDistances:
+    """What stereo measured, and what brightness tells, says of the nodes around it."""
+    return _near_nodes(_points(scene, config, spacing(nodes) / 2, shown), nodes, config)
+
+
 def _points(
     scene: Measurements, config: LinearConfig, cell: float, shown: ShownPlaces | None = None
 ) -> OrientedPoints:
     """What stereo measured and what brightness tells, merged in cubes."""
     positions, normals = scene.positions, scene.normals
-    sure = _stereo_weights(scene, config)
+    sure = stereo_weights(scene, config)
     if shown is not None:
         positions = torch.cat([positions, shown.positions])
         normals = torch.cat([normals, shown.normals])
@@ -194,7 +201,8 @@ def _points(
     return merged_points(positions, normals, sure, cell, correlated=config.correlated)
 
 
-def _stereo_weights(scene: Measurements, config: LinearConfig) -> Float[Tensor, "points"]:
+def stereo_weights(scene: Measurements, config: LinearConfig) -> Float[Tensor, "points"]:
+    """What stereo's points weigh."""
     return config.stereo * scene.confidence**config.confidence_power
 
 

@@ -28,7 +28,6 @@ from ..scene import (
     SurfaceMesh,
     View,
     transform_points,
-    within,
 )
 from .measurements import SURE
 from .originals import Original
@@ -49,6 +48,9 @@ _LEAST_CELLS = 1e-3
 
 _SHORTEST = 1e-6
 """Edges of a simplified mesh, in shares of its size: on sides that are exactly flat some have no length."""
+
+_MOST_OF_IT = 0.9
+"""Share of the faces that are kept, with which their number is about what was asked for."""
 
 PREVIEW_NODES, PREVIEW_FACES = 64, 20_000
 """Of a mesh that is only looked at: at most so many nodes along each axis, and faces."""
@@ -83,22 +85,16 @@ def extract_mesh(
     `originals`, one for each view, are read again for the texture. Raises ReconstructionError(NO_SURFACE) if
     the field has no zero level, and PHOTO_UNREADABLE.
     """
-    vertices, faces = simplified_level_set(surface, config, progress=within(progress, 0.0, 0.4))
+    progress(0.0, "level set")
+    whole = _without_floating(surface, config)
+    progress(0.2, "simplifying")
+    kept = _kept(*simplified(*whole, config.max_faces), views, region, stereo, surface.reach_world)
     progress(0.4, "support")
-    points = transform_points(region.world_from_object, stereo.points.positions.astype(np.float64))
-    cell = surface.cell_world
-    normals = vertex_normals(vertices, faces)
-    seen = visible_from(vertices, normals, [view.camera for view in views], RayCaster(vertices, faces))
-    support = support_of(vertices, seen, points, stereo.points.confidence, cell)
-    decisions: tuple[Decision, ...] = ()
-    kept = in_seen_pieces(faces, seen)
-    if len(points) and all(view.mask is None for view in views):
-        measured_scene, decision = _open_or_closed(vertices, faces, support, stereo.depth_maps, cell)
-        kept &= measured_scene
-        decisions = (decision,)
-    used = np.unique(faces[kept])
-    vertices, faces = only_used(vertices, faces[kept])
-    normals, seen, support = normals[used], seen[used], support[used]
+    if len(whole[1]) > config.max_faces and 0 < kept.share < _MOST_OF_IT:
+        # what is cut off takes none of the faces
+        more = round(config.max_faces / kept.share)
+        kept = _kept(*simplified(*whole, more), views, region, stereo, surface.reach_world)
+    vertices, faces, normals, seen = kept.vertices, kept.faces, kept.normals, kept.seen
     progress(0.6, "colour")
     coloured = colour_vertices(vertices, normals, seen, views, exposures_evened=config.exposures_evened)
     mesh = SurfaceMesh(
@@ -106,14 +102,60 @@ def extract_mesh(
         faces=faces,
         normals=normals.astype(np.float32),
         colours_srgb=coloured.colours_srgb,
-        support=support,
-        decisions=(*decisions, coloured.decision),
+        support=kept.support,
+        decisions=(*kept.decisions, coloured.decision),
     )
     if not config.textured:
         return mesh
     progress(0.7, "texture")
     texture, decision = paint(mesh, seen, views, originals, coloured.log_exposures, config.texture)
     return replace(mesh, texture=texture, decisions=(*mesh.decisions, decision))
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Kept:
+    """What photographs show of a mesh, and know of it."""
+
+    vertices: KeptVertices
+    faces: KeptFaces
+    normals: Float64[np.ndarray, "kept_vertices 3"]
+    seen: Bool[np.ndarray, "kept_vertices views"]
+    support: Float32[np.ndarray, "kept_vertices"]
+    share: float
+    """Of the faces."""
+    decisions: tuple[Decision, ...]
+
+
+def _kept(
+    vertices: Vertices,
+    faces: Faces,
+    views: tuple[View, ...],
+    region: Region,
+    stereo: StereoResult,
+    reach: float,
+) -> _Kept:
+    """The mesh without pieces that no photograph shows, and of a larger scene without what none measured."""
+    points = transform_points(region.world_from_object, stereo.points.positions.astype(np.float64))
+    normals = vertex_normals(vertices, faces)
+    seen = visible_from(vertices, normals, [view.camera for view in views], RayCaster(vertices, faces))
+    support = support_of(vertices, seen, points, stereo.points.confidence, reach)
+    kept = in_seen_pieces(faces, seen)
+    decisions: tuple[Decision, ...] = ()
+    if len(points) and all(view.mask is None for view in views):
+        measured_scene, decision = _open_or_closed(vertices, faces, support, stereo.depth_maps, reach)
+        kept &= measured_scene
+        decisions = (decision,)
+    used = np.unique(faces[kept])
+    vertices, kept_faces = only_used(vertices, faces[kept])
+    return _Kept(
+        vertices=vertices,
+        faces=kept_faces,
+        normals=normals[used],
+        seen=seen[used],
+        support=support[used],
+        share=float(kept.mean()),
+        decisions=decisions,
+    )
 
 
 def preview_mesh(
@@ -154,11 +196,15 @@ def simplified_level_set(
     Raises ReconstructionError(NO_SURFACE) if the field has no zero level.
     """
     progress(0.0, "level set")
-    vertices, faces = level_set(surface)
-    faces = without_small_pieces(vertices, faces, config.smallest_piece)
-    vertices, faces = only_used(vertices, faces)
+    whole = _without_floating(surface, config)
     progress(0.5, "simplifying")
-    return simplified(vertices, faces, config.max_faces)
+    return simplified(*whole, config.max_faces)
+
+
+def _without_floating(surface: Surface, config: MeshConfig) -> tuple[Vertices, Faces]:
+    """The zero level without small pieces."""
+    vertices, faces = level_set(surface)
+    return only_used(vertices, without_small_pieces(vertices, faces, config.smallest_piece))
 
 
 def level_set(surface: Surface) -> tuple[Vertices, Faces]:
@@ -272,10 +318,10 @@ def support_of(
     seen: Bool[np.ndarray, "vertices views"],
     points: Float64[np.ndarray, "points 3"],
     confidence: Float32[np.ndarray, "points"],
-    cell: float,
+    reach: float,
 ) -> Float32[np.ndarray, "vertices"]:
     """How well photographs back every vertex, 0 to 1 (see the module's first lines)."""
-    measured = measured_share(vertices, points, confidence, cell)
+    measured = measured_share(vertices, points, confidence, reach)
     looked_at = -np.expm1(-seen.sum(axis=1).astype(np.float64))
     return np.asarray(0.7 * measured + 0.3 * looked_at, np.float32)
 
@@ -284,16 +330,16 @@ def measured_share(
     vertices: Vertices,
     points: Float64[np.ndarray, "points 3"],
     confidence: Float32[np.ndarray, "points"],
-    cell: float,
+    reach: float,
 ) -> Float64[np.ndarray, "vertices"]:
     """How well points near every vertex back it, 0 to 1: saturates with their number and confidence."""
     if not len(points):
         return np.zeros(len(vertices))
     # beyond, the bell is less than 1e-10; a search without a bound is slow where no point is near
     distance, nearest = nearest_tree(points).query(
-        vertices, k=min(8, len(points)), distance_upper_bound=7.5 * cell, workers=-1
+        vertices, k=min(8, len(points)), distance_upper_bound=7.5 * reach, workers=-1
     )
-    near = np.exp(-((np.atleast_2d(distance.T).T / (1.5 * cell)) ** 2))
+    near = np.exp(-((np.atleast_2d(distance.T).T / (1.5 * reach)) ** 2))
     near *= np.append(confidence, 0.0)[np.atleast_2d(nearest.T).T]  # the last for those that found none
     return np.asarray(-np.expm1(-near.sum(axis=1)))
 
@@ -303,7 +349,7 @@ def _open_or_closed(
     faces: Faces,
     support: Float32[np.ndarray, "vertices"],
     depth_maps: tuple[DepthMap, ...],
-    cell: float,
+    reach: float,
 ) -> tuple[Bool[np.ndarray, "faces"], Decision]:
     """Which faces to keep where there are no masks.
 
@@ -317,7 +363,7 @@ def _open_or_closed(
         decision = Decision(what="back side", choice="closed smoothly", because=because)
         return np.ones(len(faces), bool), decision
     distance, _ = nearest_tree(vertices[measured]).query(vertices, workers=-1)
-    keep_vertex = distance < 5 * cell
+    keep_vertex = distance < 5 * reach
     decision = Decision(what="back side", choice="cut off", because=f"{because}: a piece of a larger scene")
     return keep_vertex[faces].all(axis=1), decision
 

@@ -22,6 +22,6 @@ def mesh_of_points(
         faces=faces,
         normals=vertex_normals(vertices, faces).astype(np.float32),
         colours_srgb=np.full((len(vertices), 3), _GREY, np.uint8),
-        support=measured_share(vertices, cloud.positions, sure, surface.cell_world).astype(np.float32),
+        support=measured_share(vertices, cloud.positions, sure, surface.reach_world).astype(np.float32),
         decisions=surface.decisions,
     )

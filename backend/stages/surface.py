@@ -27,12 +27,15 @@ class Surface:
     """A similarity: the cube is laid tightly around the surface."""
     radiance: Radiance | None = None
     """The field to render from, where one was fitted."""
+    reach_cells: float = 1.0
+    """How far around it a measurement speaks: more than a cell where only detail is on so fine a grid."""
     decisions: tuple[Decision, ...] = ()
 
     @property
-    def cell_world(self) -> float:
-        """Side of a cell, world units."""
-        return float(spacing(len(self.distance)) / np.cbrt(np.linalg.det(self.grid_from_world[:3, :3])))
+    def reach_world(self) -> float:
+        """The same in world units."""
+        cell = spacing(len(self.distance)) / np.cbrt(np.linalg.det(self.grid_from_world[:3, :3]))
+        return float(self.reach_cells * cell)
 
 
 ShowSurface = Callable[[Surface], None]

@@ -8,6 +8,7 @@ the photographs (render_fit).
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import partial
 
 import torch
 from jaxtyping import Float
@@ -16,6 +17,7 @@ from torch import Tensor
 from ..maths.grid import refined, spacing
 from ..scene import Decision, Progress, Region, StereoResult, View, within
 from .deadline import Clock, Deadline, GridCost, deadline_after, finest_grid, predicted_s
+from .detail import add_detail
 from .inner_outlines import FarSide, decision, far_sides
 from .linear_fit import Ask, LinearConfig, fit_level, for_plain, for_textured, start, weight_beside
 from .measurements import Measurements, carried, measurements
@@ -43,6 +45,8 @@ class TrainConfig:
     looks: tuple[int, int, int] = (0, 6, 2)
     """Before how many of the last rounds it asks what brightness tells, if patches are mostly silent:
     on the first grid, on those between, on the last one."""
+    detail: int = 256
+    """Nodes along each axis of the grid that what stereo measured is put on in the end, at most."""
     linear: LinearConfig = field(default_factory=LinearConfig)
     render: RenderConfig = field(default_factory=RenderConfig)
     budget_s: float | None = None
@@ -84,8 +88,9 @@ def fit_surface(
     told: list[FarSide] = []
     shown: list[ShownPlaces] = []
     shares: list[float] = []
-    levels = zip(config.levels, config.rounds, config.steps, strict=True)
-    for level, (wanted, rounds, steps) in enumerate(levels):
+    for level, (wanted, rounds, steps) in enumerate(
+        zip(config.levels, config.rounds, config.steps, strict=True)
+    ):
         nodes = finest_grid(costs, len(distance), wanted, deadline.left_s())
         if nodes == len(distance) < wanted:
             break
@@ -116,12 +121,36 @@ def fit_surface(
             rendered += better.steps
             taken_back += better.taken_back
             done += steps
-    made = _decisions(scene, frame, config, depth, nodes=len(distance), rendered=rendered)
-    made = (*made, decision(told), of_brightness(shares, shown), _of_rendering(config, rendered, taken_back))
+    progress(0.95, "detail")
+    with torch.no_grad():
+        detailed, of_detail = add_detail(
+            scene,
+            torch.from_numpy(stereo.points.view_index).to(device),
+            distance,
+            config.detail,
+            config.linear,
+            partial(_in_time, costs, deadline),
+        )
+    made = (
+        *_decisions(scene, frame, config, depth, nodes=len(distance), rendered=rendered),
+        of_detail,
+        decision(told),
+        of_brightness(shares, shown),
+        _of_rendering(config, rendered, taken_back),
+    )
     if config.budget_s is not None:
-        used_s = config.budget_s - deadline.left_s()
-        made = (*made, _of_budget(config.budget_s, used_s, config, costs, rendered))
-    return Surface(distance=distance.cpu().numpy(), grid_from_world=frame.object_from_world, decisions=made)
+        made = (*made, _of_budget(config.budget_s, deadline.left_s(), config, costs, rendered))
+    return Surface(
+        distance=detailed.cpu().numpy(),
+        grid_from_world=frame.object_from_world,
+        reach_cells=spacing(len(distance)) / spacing(len(detailed)),
+        decisions=made,
+    )
+
+
+def _in_time(costs: Sequence[GridCost], deadline: Deadline, nodes: int) -> bool:
+    """Whether there would be time for all of a fit, of which detail is a part."""
+    return predicted_s(costs, nodes) <= deadline.left_s()
 
 
 def _told_last(shown: Sequence[ShownPlaces]) -> ShownPlaces | None:
@@ -189,11 +218,11 @@ def _asking(
 
 
 def _of_budget(
-    budget_s: float, used_s: float, config: TrainConfig, costs: Sequence[GridCost], rendered: int
+    budget_s: float, left_s: float, config: TrainConfig, costs: Sequence[GridCost], rendered: int
 ) -> Decision:
     """What the time was enough for."""
     nodes, wanted, steps = costs[-1].nodes, config.levels[-1], sum(config.steps)
-    why = f"{budget_s:g} s given, {used_s:.1f} s used"
+    why = f"{budget_s:g} s given, {budget_s - left_s:.1f} s used"
     if nodes < wanted:
         choice = f"stopped at a grid of {nodes}"
         why += f"; a grid of {wanted} is predicted to take {predicted_s(costs, wanted):.1f} s"
