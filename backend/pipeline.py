@@ -57,7 +57,7 @@ _BYTES_PER_PIXEL = MappingProxyType({"photos": 16, "cameras": 24, "stereo": 40})
 points. Measured: 12 to 16, 14 to 18, 8 to 23."""
 _SHORT_BY_LONG_SIDE = 0.75
 """Of most photographs; the others are a little narrower."""
-_BYTES_FOR_RESULTS = 200_000_000
+_BYTES_FOR_RESULTS = 400_000_000
 _COMPUTING_FOLDERS = ("kernels", "maths", "stages")
 _COMPUTING_MODULES = (
     "errors.py",

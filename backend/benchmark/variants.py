@@ -113,6 +113,7 @@ VARIANTS = (
     ),
     # the mesh, and cameras
     Variant(name="floating pieces kept", changes={"mesh.smallest_piece": 0.0}),
+    Variant(name="without detail", changes={"train.detail": 0}),
     Variant(name="colours of vertices alone", changes={"mesh.textured": False}),
     Variant(name="exposures not looked at", changes={"mesh.exposures_evened": False}),
     Variant(name="cameras held against the surface", cameras_doubted=True),

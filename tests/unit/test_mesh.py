@@ -409,6 +409,21 @@ def test_a_piece_of_a_larger_scene_loses_its_back() -> None:
     assert lengths == {mesh.faces.max() + 1}
 
 
+def test_what_is_cut_off_takes_none_of_the_faces() -> None:
+    stereo, few = measured(floor_points(), edge_confidence=0.6), MeshConfig(max_faces=1500, textured=False)
+    mesh = extract(body_scene().without_masks(), floor_surface(), stereo, few)
+    assert back_side(mesh) == ["cut off"]
+    assert 0.85 * 1500 < len(mesh.faces) < 1.15 * 1500
+
+
+def test_support_reaches_as_far_as_the_surface_says() -> None:
+    stereo, quick = measured(front_points()), MeshConfig(textured=False)
+    near = extract(body_scene(), body_surface(), stereo, quick).support
+    far = extract(body_scene(), replace(body_surface(), reach_cells=3.0), stereo, quick).support
+    assert (far >= near - 1e-6).all()
+    assert (far > near + 0.2).any()
+
+
 @pytest.mark.parametrize(("edge_confidence", "choice"), [(0.2, "closed smoothly"), (0.5, "cut off")])
 def test_only_sure_measurements_at_the_edges_open_a_scene(edge_confidence: float, choice: str) -> None:
     stereo = measured(floor_points(), edge_confidence=edge_confidence)
