@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float32, Float64, Int64
 from skimage.measure import marching_cubes
 
 from ..errors import ErrorCode, ReconstructionError
+from ..maths.clipping import clipped
 from ..maths.faces import area_vectors, face_areas
 from ..maths.grid import near_surface, refined, spacing
 from ..maths.nearest import nearest_tree
@@ -48,6 +49,9 @@ _LEAST_CELLS = 1e-3
 
 _SHORTEST = 1e-6
 """Edges of a simplified mesh, in shares of its size: on sides that are exactly flat some have no length."""
+
+_LOOSE_REACHES = 5.0
+"""How far surface goes on beyond what was measured, in what a measurement reaches, in a larger scene."""
 
 _MOST_OF_IT = 0.9
 """Share of the faces that are kept, with which their number is about what was asked for."""
@@ -139,21 +143,25 @@ def _kept(
     normals = vertex_normals(vertices, faces)
     seen = visible_from(vertices, normals, [view.camera for view in views], RayCaster(vertices, faces))
     support = support_of(vertices, seen, points, stereo.points.confidence, reach)
-    kept = in_seen_pieces(faces, seen)
+    whole, faces = len(faces), faces[in_seen_pieces(faces, seen)]
     decisions: tuple[Decision, ...] = ()
     if len(points) and all(view.mask is None for view in views):
-        measured_scene, decision = _open_or_closed(vertices, faces, support, stereo.depth_maps, reach)
-        kept &= measured_scene
+        beyond, decision = _open_or_closed(vertices, support, stereo.depth_maps, reach)
         decisions = (decision,)
-    used = np.unique(faces[kept])
-    vertices, kept_faces = only_used(vertices, faces[kept])
+        if beyond is not None:
+            scene = clipped(faces, beyond)
+            vertices, support = scene.extended(vertices), scene.extended(support)
+            normals = _unit(scene.extended(normals))
+            seen, faces = np.concatenate([seen, seen[scene.ends].all(axis=1)]), scene.faces
+    used = np.unique(faces)
+    vertices, kept_faces = only_used(vertices, faces)
     return _Kept(
         vertices=vertices,
         faces=kept_faces,
         normals=normals[used],
         seen=seen[used],
         support=support[used],
-        share=float(kept.mean()),
+        share=len(kept_faces) / whole,
         decisions=decisions,
     )
 
@@ -279,7 +287,7 @@ def simplified(vertices: Vertices, faces: Faces, max_faces: int) -> tuple[KeptVe
         fewer = without_short_edges(points.astype(np.float64), fewer.astype(np.int64), _SHORTEST)
         if not closed or trimesh.Trimesh(points, fewer, process=False).is_watertight:
             return only_used(points.astype(np.float64) * size + middle, fewer)
-        target *= 2
+        target = round(1.2 * target)
     return vertices, faces
 
 
@@ -309,8 +317,13 @@ def vertex_normals(vertices: Vertices, faces: Faces) -> Float64[np.ndarray, "ver
         ],
         axis=1,
     )
-    length = np.linalg.norm(normals, axis=1, keepdims=True)
-    return normals / np.where(length > 0, length, 1.0)
+    return _unit(normals)
+
+
+def _unit(vectors: Float64[np.ndarray, "vectors 3"]) -> Float64[np.ndarray, "vectors 3"]:
+    """Of length 1, but for those without any."""
+    length = np.linalg.norm(vectors, axis=1, keepdims=True)
+    return np.asarray(vectors / np.where(length > 0, length, 1.0))
 
 
 def support_of(
@@ -346,26 +359,24 @@ def measured_share(
 
 def _open_or_closed(
     vertices: Vertices,
-    faces: Faces,
     support: Float32[np.ndarray, "vertices"],
     depth_maps: tuple[DepthMap, ...],
     reach: float,
-) -> tuple[Bool[np.ndarray, "faces"], Decision]:
-    """Which faces to keep where there are no masks.
+) -> tuple[Float64[np.ndarray, "vertices"] | None, Decision]:
+    """How far a vertex lies beyond the end of the surface, < 0 before it, where there are no masks.
 
     If measured surface runs out of the pictures, they show a piece of a larger scene, whose back does not
-    exist: surface far from any measurement is cut off. Otherwise the object stays closed.
+    exist: surface far from any measurement is cut off. Otherwise the object stays closed: None.
     """
     at_edges = float(np.mean([measured_at_edges(map_) for map_ in depth_maps]))
     because = f"{at_edges:.1%} of the pictures' edges show measured surface"
     measured = support > 0.5
     if at_edges < MEASURED_EDGES or not measured.any():
         decision = Decision(what="back side", choice="closed smoothly", because=because)
-        return np.ones(len(faces), bool), decision
+        return None, decision
     distance, _ = nearest_tree(vertices[measured]).query(vertices, workers=-1)
-    keep_vertex = distance < 5 * reach
     decision = Decision(what="back side", choice="cut off", because=f"{because}: a piece of a larger scene")
-    return keep_vertex[faces].all(axis=1), decision
+    return distance - _LOOSE_REACHES * reach, decision
 
 
 def measured_at_edges(map_: DepthMap) -> float:
