@@ -16,7 +16,7 @@ from torch import Tensor
 
 from ..maths.grid import refined, spacing
 from ..scene import Decision, Progress, Region, StereoResult, View, within
-from .deadline import Clock, Deadline, GridCost, deadline_after, finest_grid, predicted_s
+from .deadline import PESSIMISM, Clock, Deadline, GridCost, deadline_after, finest_grid, predicted_s
 from .detail import add_detail
 from .inner_outlines import FarSide, decision, far_sides
 from .linear_fit import Ask, LinearConfig, fit_level, for_plain, for_textured, start, weight_beside
@@ -129,7 +129,7 @@ def fit_surface(
             distance,
             config.detail,
             config.linear,
-            partial(_in_time, costs, deadline),
+            partial(_in_time, costs[-1], config.rounds[-1], deadline),
         )
     made = (
         *_decisions(scene, frame, config, depth, nodes=len(distance), rendered=rendered),
@@ -148,9 +148,9 @@ def fit_surface(
     )
 
 
-def _in_time(costs: Sequence[GridCost], deadline: Deadline, nodes: int) -> bool:
-    """Whether there would be time for all of a fit, of which detail is a part."""
-    return predicted_s(costs, nodes) <= deadline.left_s()
+def _in_time(last: GridCost, rounds: int, deadline: Deadline, nodes: int) -> bool:
+    """Whether there is time for detail on so many nodes: it is like one of the `rounds` of the last grid."""
+    return PESSIMISM * last.seconds / rounds * (nodes / last.nodes) ** 3 <= deadline.left_s()
 
 
 def _told_last(shown: Sequence[ShownPlaces]) -> ShownPlaces | None:
