@@ -57,7 +57,7 @@ def stereo() -> StereoResult:
 
 
 def fitted(views: tuple[View, ...], steps: int) -> Surface:
-    config = TrainConfig(levels=(NODES,), rounds=(1,), steps=(steps,), render=FEW)
+    config = TrainConfig(levels=(NODES,), rounds=(1,), steps=(steps,), detail=0, render=FEW)
     chance = torch.Generator().manual_seed(0)
     return fit_surface(
         views, true_region(), stereo(), config, device=CPU, generator=chance, progress=no_progress

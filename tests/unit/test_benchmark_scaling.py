@@ -134,7 +134,7 @@ def toy_scene(photos: Path) -> Case:
 
 
 def small(num_views: int) -> Setup:
-    train = TrainConfig(levels=(24, 32), rounds=(3, 3), steps=(0, 2))
+    train = TrainConfig(levels=(24, 32), rounds=(3, 3), steps=(0, 2), detail=0)
     settings = Settings(photos=PhotosConfig(max_side_px=80), train=train)
     return Setup(num_views=num_views, settings=settings)
 

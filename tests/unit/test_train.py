@@ -232,7 +232,7 @@ def test_a_seed_repeats_to_the_bit_and_another_one_does_not() -> None:
 def test_unfinished_surfaces_are_shown_and_change_nothing() -> None:
     """One for each level, each nearer to the truth; the last one is what rendering starts from."""
     shown: list[Surface] = []
-    config = TrainConfig(levels=(16, 32), rounds=(5, 5), steps=(0, 3))
+    config = TrainConfig(levels=(16, 32), rounds=(5, 5), steps=(0, 3), detail=0)
     torch.use_deterministic_algorithms(True)
     try:
         seen = fitted(masked_scene(), true_region(), masked_stereo(), config, show=shown.append)
@@ -301,7 +301,9 @@ def ticking(tick_s: float) -> Callable[[], float]:
 
 def limited(budget_s: float | None, steps: int = 20, tick_s: float = 1.0) -> Surface:
     """Of levels that all cost one tick of the clock; deterministic."""
-    config = TrainConfig(levels=(16, 24, 32), rounds=(5, 5, 5), steps=(0, 0, steps), budget_s=budget_s)
+    config = TrainConfig(
+        levels=(16, 24, 32), rounds=(5, 5, 5), steps=(0, 0, steps), detail=0, budget_s=budget_s
+    )
     torch.use_deterministic_algorithms(True)
     try:
         return fitted(masked_scene(), true_region(), masked_stereo(), config, clock=ticking(tick_s))
