@@ -92,12 +92,13 @@ def extract_mesh(
     progress(0.0, "level set")
     whole = _without_floating(surface, config)
     progress(0.2, "simplifying")
-    kept = _kept(*simplified(*whole, config.max_faces), views, region, stereo, surface.reach_world)
+    points = transform_points(region.world_from_object, stereo.points.positions.astype(np.float64))
+    kept = _kept(*simplified(*whole, config.max_faces), views, points, stereo, surface.reach_world)
     progress(0.4, "support")
     if len(whole[1]) > config.max_faces and 0 < kept.share < _MOST_OF_IT:
         # what is cut off takes none of the faces
         more = round(config.max_faces / kept.share)
-        kept = _kept(*simplified(*whole, more), views, region, stereo, surface.reach_world)
+        kept = _kept(*simplified(*whole, more), views, points, stereo, surface.reach_world)
     vertices, faces, normals, seen = kept.vertices, kept.faces, kept.normals, kept.seen
     progress(0.6, "colour")
     coloured = colour_vertices(vertices, normals, seen, views, exposures_evened=config.exposures_evened)
@@ -134,12 +135,14 @@ def _kept(
     vertices: Vertices,
     faces: Faces,
     views: tuple[View, ...],
-    region: Region,
+    points: Float64[np.ndarray, "points 3"],
     stereo: StereoResult,
     reach: float,
 ) -> _Kept:
-    """The mesh without pieces that no photograph shows, and of a larger scene without what none measured."""
-    points = transform_points(region.world_from_object, stereo.points.positions.astype(np.float64))
+    """The mesh without pieces that no photograph shows, and of a larger scene without what none measured.
+
+    `points` are those of stereo, world frame.
+    """
     normals = vertex_normals(vertices, faces)
     seen = visible_from(vertices, normals, [view.camera for view in views], RayCaster(vertices, faces))
     support = support_of(vertices, seen, points, stereo.points.confidence, reach)

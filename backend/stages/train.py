@@ -83,7 +83,7 @@ def fit_surface(
         costs = [GridCost(nodes=COARSEST, seconds=clock() - began_s)]
         scene = carried(scene, views, region, frame_from_object)
         distance = start(scene, radius, config.levels[0])
-    total = sum(config.steps) + 10 * len(config.levels)
+    total = sum(config.steps) + 10 * (len(config.levels) + 1)  # detail is one more
     done, rendered, taken_back = 0, 0, 0
     told: list[FarSide] = []
     shown: list[ShownPlaces] = []
@@ -121,7 +121,7 @@ def fit_surface(
             rendered += better.steps
             taken_back += better.taken_back
             done += steps
-    progress(0.95, "detail")
+    progress(done / total, "detail")
     with torch.no_grad():
         detailed, of_detail = add_detail(
             scene,
