@@ -85,16 +85,13 @@ def merged_points(
     """
     if not len(positions):
         return positions, normals, confidence
-    cubes, cube_of = torch.unique(_faced_cubes(positions, normals, cell), return_inverse=True)
-    one = torch.ones_like(confidence)
-    weighted = torch.column_stack([positions, normals, one, confidence]) * confidence[:, None]
-    sums = positions.new_zeros((len(cubes), 8)).index_add_(0, cube_of, weighted)
-    kept = sums[sums[:, 6] > 0]
-    total = kept[:, 6]
+    columns = torch.column_stack([positions, normals, confidence])
+    _, sums = _weighted_sums(_faced_cubes(positions, normals, cell), columns, confidence)
+    total = sums[:, -1]
     return (
-        kept[:, :3] / total[:, None],
-        F.normalize(kept[:, 3:6], dim=-1),
-        kept[:, 7] / total if correlated else total,
+        sums[:, :3] / total[:, None],
+        F.normalize(sums[:, 3:6], dim=-1),
+        sums[:, 6] / total if correlated else total,
     )
 
 
@@ -112,16 +109,26 @@ def scatter_between(
     """
     if not len(positions):
         return math.inf
-    keys = _faced_cubes(positions, normals, cell) * (views.max() + 1) + views
-    groups, group_of = torch.unique(keys, return_inverse=True)
-    weighted = torch.column_stack([positions, normals, torch.ones_like(confidence)]) * confidence[:, None]
-    sums = positions.new_zeros((len(groups), 7)).index_add_(0, group_of, weighted)
-    place, normal = sums[:, :3] / sums[:, 6:], F.normalize(sums[:, 3:6], dim=-1)
-    cube = groups // (views.max() + 1)
-    shared = (cube[1:] == cube[:-1]) & (sums[1:, 6] > 0) & (sums[:-1, 6] > 0)
+    num_views = int(views.max()) + 1
+    keys = _faced_cubes(positions, normals, cell) * num_views + views
+    groups, sums = _weighted_sums(keys, torch.column_stack([positions, normals]), confidence)
+    place, normal = sums[:, :3] / sums[:, -1:], F.normalize(sums[:, 3:6], dim=-1)
+    cube = groups // num_views
+    shared = cube[1:] == cube[:-1]
     along = F.normalize(normal[1:] + normal[:-1], dim=-1)[shared]
     apart = ((place[1:] - place[:-1])[shared] * along).sum(dim=-1).abs()
     return float(apart.median()) if len(apart) >= _ENOUGH_SHARED else math.inf
+
+
+def _weighted_sums(
+    keys: Int64[Tensor, "points"], columns: Float[Tensor, "points columns"], weight: Float[Tensor, "points"]
+) -> tuple[Int64[Tensor, "groups"], Float[Tensor, "groups columns+1"]]:
+    """Sums over points of the same key, the last of the weight itself; keys of no weight are left out."""
+    groups, group_of = torch.unique(keys, return_inverse=True)
+    weighted = torch.column_stack([columns, torch.ones_like(weight)]) * weight[:, None]
+    sums = columns.new_zeros((len(groups), weighted.shape[1])).index_add_(0, group_of, weighted)
+    any_weight = sums[:, -1] > 0
+    return groups[any_weight], sums[any_weight]
 
 
 def _faced_cubes(

@@ -6,6 +6,7 @@ field is held as it was. How fine it is, pixels say, and how well two photograph
 grid shows their noise.
 """
 
+import math
 from collections.abc import Callable
 from statistics import median
 
@@ -55,7 +56,11 @@ def add_detail(
     scatter = scatter_between(scene.positions, scene.normals, weights, views, spacing(coarse) / 2)
     cells = scatter / spacing(coarse)
     nodes = min(most, int(coarse * min(px / _LEAST_PX, _MOST_SCATTER / max(cells, torch.finfo().tiny))))
-    because = f"a cell of the grid is {px:.1f} pixels wide, and two photographs differ by {cells:.2f} cells"
+    because = f"a cell of the grid is {px:.1f} pixels wide, and " + (
+        f"two photographs differ by {cells:.2f} cells"
+        if math.isfinite(cells)
+        else "hardly any place was measured by two photographs"
+    )
     wanted = nodes >= _WORTH_IT * coarse
     if not wanted or not there_is_time(nodes):
         because += "; there is no time left" if wanted else ""

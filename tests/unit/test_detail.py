@@ -117,6 +117,7 @@ def test_without_points_there_is_no_detail() -> None:
     empty = replace(scene, **{name: getattr(scene, name)[none] for name in names})
     distance, decision = add_detail(empty, views[none], flat(), FINE, LinearConfig(), lambda _: True)
     assert (len(distance), decision.choice) == (COARSE, "left out")
+    assert "hardly any place was measured by two photographs" in decision.because
 
 
 @pytest.mark.parametrize("offset", [0.0, 0.003, 0.02])
