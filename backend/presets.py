@@ -55,6 +55,7 @@ PRESETS = MappingProxyType(
                 coarse_pixels=15_000,
                 growth_rounds=(1, 2, 2),
                 free_leverage=1.2,
+                trust_of_half_size=0.63,
             ),
             train=TrainConfig(
                 levels=(32, 64, 96),

@@ -48,7 +48,10 @@ VARIANTS = (
     Variant(name="without a second sweep", changes={"stereo.sweep_again": False}),
     Variant(name="without growth", changes={"stereo.growth_rounds": (0, 0, 0)}),
     Variant(name="without semi-global matching", changes={"stereo.semi_global": False}),
-    Variant(name="full size alone", changes={"stereo.trust_of_half_size": 0.0}),
+    Variant(
+        name="full size alone",
+        changes={"stereo.trust_of_half_size": 0.0, "stereo.trust_if_textured": 0.0},
+    ),
     Variant(name="small pieces kept", changes={"stereo.min_piece_px": 0}),
     Variant(name="sharpness ignored", changes={"stereo.full_sharpness": _NEXT_TO_NOTHING}),
     Variant(name="edges ignored", changes={"stereo.edge_doubt": _NEXT_TO_NOTHING}),

@@ -56,6 +56,8 @@ class Measured:
     """How much the agreement of patches drops one pixel of disparity off, to either side."""
     from_edge_px: Float[Tensor, "height width"]
     """Distance to the nearest pixel off the subject or beside a jump of the map; 0 there."""
+    trust: Float[Tensor, "height width"]
+    """Share of its confidence that is left to it: 1 at the first size."""
 
 
 def depth_maps(
@@ -93,18 +95,27 @@ def depth_maps(
         ]
         votes = [_votes(index, sharp, nearby, config) for index in range(len(sharp))]
         by_size.insert(0, [_measured(*one, config) for one in zip(sharp, votes, sources, strict=True)])
-    return [_each_once(list(sizes)) for sizes in zip(*by_size, strict=True)]
+    return [_each_once(list(sizes), config) for sizes in zip(*by_size, strict=True)]
 
 
-def _each_once(sizes: list[Measured]) -> list[Measured]:
-    """Without what a finer size has measured already."""
-    once, known = [sizes[0]], sizes[0].votes > 0
+def _each_once(sizes: list[Measured], config: StereoConfig) -> list[Measured]:
+    """Without what a finer size has measured already, and what is left trusted less.
+
+    Least where the finest size had texture enough and yet measured nothing: there is an edge then, or
+    something that hides, and a large patch sees past it as little as a small one.
+    """
+    once, known, halvings = [sizes[0]], sizes[0].votes > 0, 0
+    textured = sizes[0].map.window.textured.float()
     for coarse in sizes[1:]:
         if coarse.map.window is once[-1].map.window:
             continue  # the pyramid of another view is higher
         height, width = coarse.votes.shape
         known = F.max_pool2d(known[None, : 2 * height, : 2 * width].float(), 2)[0] > 0
-        once.append(replace(coarse, votes=torch.where(known, 0.0, coarse.votes)))
+        textured = F.avg_pool2d(textured[None, : 2 * height, : 2 * width], 2)[0]
+        halvings += 1
+        plain, missed = config.trust_of_half_size**halvings, config.trust_if_textured**halvings
+        trust = torch.where(textured > 0.5, missed, plain)
+        once.append(replace(coarse, votes=torch.where(known, 0.0, coarse.votes), trust=trust))
         known = known | (coarse.votes > 0)
     return once
 
@@ -253,9 +264,10 @@ def _measured(
 
     A few pixels alone agree by chance.
     """
+    all_of_it = torch.ones_like(votes)
     if not sources:
         nothing = torch.zeros_like(votes)
-        return Measured(map=current, votes=nothing, sharpness=nothing, from_edge_px=nothing)
+        return Measured(map=current, votes=nothing, sharpness=nothing, from_edge_px=nothing, trust=all_of_it)
     step = step_of_one_pixel(current.window, sources, current.inverse_depth)
     sharpness = _sharpness(current, step, sources, config)
     largest_step = _LARGEST_STEP_PX * step
@@ -268,6 +280,7 @@ def _measured(
         votes=torch.where(large, votes, 0.0),
         sharpness=sharpness,
         from_edge_px=from_edge_px,
+        trust=all_of_it,
     )
 
 

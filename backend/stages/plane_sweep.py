@@ -33,9 +33,6 @@ _AT_A_TIME = 16
 """Planes that are compared before the next are thought of."""
 _FARTHEST = 0.02
 """Of the inverse depth at the region's end: nothing farther off moves between photographs."""
-_TEXTURED = 6.0
-"""Contrast of a patch, in deviations of noise, from which all depths are tried again: of many, one agrees by
-chance."""
 _AGREES_BETTER = 0.05
 """By that much it has to, at a depth that takes the place of another."""
 _FEWEST_MEASURED = 100
@@ -117,8 +114,7 @@ def swept_again(
     Not off the `subjects` that other photographs show.
     """
     window, sure = current.window, measured & (current.score > config.growth_correlation)
-    asked = window.subject & ~sure & (current.behind == 0)
-    asked &= window.patches.variance > (_TEXTURED * window.noise) ** 2
+    asked = window.subject & window.textured & ~sure & (current.behind == 0)
     # beside an edge, patches reach over it
     asked &= window_mean(asked.float(), torch.ones_like(window.grey), config.patch_radius) > 0.5
     if not sources or int(sure.sum()) < _FEWEST_MEASURED or not asked.any():

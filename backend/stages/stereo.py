@@ -103,17 +103,15 @@ def _points_of_map(
 def _confidence(measured: Measured, config: StereoConfig) -> Float[Tensor, "height width"]:
     """Agreement of the patches; 0 where nothing is measured.
 
-    Where two views agree it is half as much as where many do. It is less for large pixels, where the patches
-    would agree as well at another depth, where their texture lies to one side, and beside edges.
+    Where two views agree it is half as much as where many do. It is less where the patches would agree as
+    well at another depth, where their texture lies to one side, beside edges, and for large pixels.
     """
     window = measured.map.window
     agreement = measured.map.score.clamp(0, 1)
     certain = -torch.expm1(-0.7 * (measured.votes - 1).clamp(min=0))
-    halvings = math.log2(max(1.0, window.pixel_size / config.first_pixel_size))
-    trust: float = config.trust_of_half_size**halvings
     sharp = (measured.sharpness / config.full_sharpness).clamp(0, 1).sqrt()
     off_edge = measured.from_edge_px / (measured.from_edge_px + config.edge_doubt * config.patch_radius)
-    confidence: Float[Tensor, "height width"] = trust * agreement * certain * sharp * off_edge
+    confidence: Float[Tensor, "height width"] = measured.trust * agreement * certain * sharp * off_edge
     if config.free_leverage is not None:
         aside = leverage(window.grey, window.subject, config.patch_radius, window.noise)
         confidence = confidence * (config.free_leverage / aside).clamp(max=1)

@@ -35,12 +35,13 @@ class StereoConfig:
     """
     max_reprojection_px: float = 1.0
     """How far a point may move when carried to another photograph's depth map and back."""
-    trust_of_half_size: float = 0.63
+    trust_of_half_size: float = 0.8
     """Share of its confidence that is left to what only photographs of half the size show.
 
-    Where little is textured the fit weighs points by the cube of it: a quarter, as a pixel there stands
-    for four.
+    Where little is textured the fit weighs points by the cube of it: half.
     """
+    trust_if_textured: float = 0.63
+    """The same where the first size has texture, and yet showed nothing."""
     max_points: int = 500_000
     """Points kept, evenly over all that are measured; depth maps keep every pixel."""
     growth_rounds: tuple[int, int, int] = (2, 4, 4)

@@ -17,6 +17,9 @@ from ..maths.rays import sphere_span
 from ..scene import Region, View
 from .stereo_config import StereoConfig
 
+_TEXTURED = 6.0
+"""Contrast of a patch, in deviations of noise, with which it is like no other; of all depths of one that has
+less, some agrees by chance."""
 _DETOUR = 1.25
 """A view is between two others if the way past it is at most so many times as long."""
 
@@ -38,6 +41,11 @@ class Window:
     subject: Bool[Tensor, "height width"]
     surrounded: bool
     """Whether neither a mask nor an even backdrop parts the subject from what is around it."""
+
+    @property
+    def textured(self) -> Bool[Tensor, "height width"]:
+        """Where patches are like no other."""
+        return self.patches.variance > (_TEXTURED * self.noise) ** 2
 
 
 def pyramid(view: View, region: Region, config: StereoConfig, device: torch.device) -> list[Window]:

@@ -99,23 +99,28 @@ def test_surface_that_turns_away_is_grown_from_its_neighbour() -> None:
     assert np.quantile(errors_percent(grown), 0.95) < 1.1 * np.quantile(errors_percent(swept), 0.95)
 
 
-def test_weak_texture_is_measured_on_smaller_photographs() -> None:
-    """Blurred until a patch shows next to nothing; what larger patches add is right, and trusted less."""
+@cache
+def blurred() -> Scene:
+    """Until a patch shows next to nothing."""
     wide = photographed(arc_cameras(3, 30, 320))
-    blurred = tuple(
-        replace(view, image_srgb=gaussian_filter(view.image_srgb, (6, 6, 0)) * 0.5) for view in wide.views
+    faint = (gaussian_filter(view.image_srgb, (6, 6, 0)) * 0.5 for view in wide.views)
+    views = tuple(replace(view, image_srgb=image) for view, image in zip(wide.views, faint, strict=True))
+    return replace(wide, views=views)
+
+
+@cache
+def matched_blurred(trust: float, if_textured: float) -> StereoResult:
+    config = StereoConfig(coarse_pixels=10_000, trust_of_half_size=trust, trust_if_textured=if_textured)
+    return match_views(
+        blurred().views, true_region(), config, device=torch.device("cpu"), progress=no_progress
     )
-    results = [
-        match_views(
-            blurred,
-            true_region(),
-            StereoConfig(coarse_pixels=10_000, trust_of_half_size=trust),
-            device=torch.device("cpu"),
-            progress=no_progress,
-        )
-        for trust in (0.0, 0.4)
-    ]
-    maps = list(zip(*(result.depth_maps for result in results), wide.depths, wide.coverage, strict=True))
+
+
+def test_weak_texture_is_measured_on_smaller_photographs() -> None:
+    """What larger patches add is right, and trusted less."""
+    results = (matched_blurred(0.0, 0.0), matched_blurred(0.4, 0.1))
+    depths = (result.depth_maps for result in results)
+    maps = list(zip(*depths, blurred().depths, blurred().coverage, strict=True))
     full, both = (np.mean([(m[i].depth > 0)[m[3]].mean() for m in maps]) for i in (0, 1))
     assert both > full + 0.1
     for fine, all_sizes, truth, covered in maps:
@@ -124,6 +129,21 @@ def test_weak_texture_is_measured_on_smaller_photographs() -> None:
         assert np.median(apart) < 1
         assert all_sizes.confidence[added].max() <= 0.4
         np.testing.assert_array_equal(all_sizes.depth[fine.depth > 0], fine.depth[fine.depth > 0])
+
+
+def test_smaller_photographs_are_trusted_least_where_the_first_size_has_texture() -> None:
+    """Grain that is another in each photograph looks like texture there, and like nothing on smaller ones."""
+    config = StereoConfig(coarse_pixels=10_000, trust_of_half_size=0.9, trust_if_textured=0.05)
+    grainy = tuple(noise(view, seed, 20 / 255) for seed, view in enumerate(blurred().views))
+    for views, is_textured, least, most in ((blurred().views, 0, 0.3, 1.0), (grainy, 1, 0.0, 0.05)):
+        result = match_views(views, true_region(), config, device=torch.device("cpu"), progress=no_progress)
+        sizes = [pyramid(view, true_region(), config, torch.device("cpu")) for view in views]
+        assert np.mean([size[0].textured[size[0].subject].float().mean() for size in sizes]) == (
+            pytest.approx(is_textured, abs=0.2)
+        )
+        confidence = np.concatenate([map_.confidence[map_.depth > 0] for map_ in result.depth_maps])
+        assert least < np.quantile(confidence, 0.99) <= most
+        assert len(confidence) > 10_000
 
 
 def test_photographs_may_be_compared_at_half_their_size() -> None:
