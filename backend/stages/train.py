@@ -11,25 +11,19 @@ from dataclasses import dataclass, field
 from functools import partial
 
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
 from ..maths.grid import refined, spacing
 from ..scene import Decision, Progress, Region, StereoResult, View, within
 from .deadline import PESSIMISM, Clock, Deadline, GridCost, deadline_after, finest_grid, predicted_s
 from .detail import add_detail
 from .inner_outlines import FarSide, decision, far_sides
-from .linear_fit import Ask, LinearConfig, fit_level, for_plain, for_textured, start, weight_beside
+from .linear_fit import LinearConfig, fit_level, start
+from .looks import Looks
 from .measurements import Measurements, carried, measurements
 from .render_fit import RenderConfig, refine
 from .safe_steps import not_finite
-from .shared_brightness import MOSTLY_TEXTURED, ShownPlaces, share_told, shared_brightness, textured
-from .shared_brightness import decision as of_brightness
 from .surface import COARSEST, ShowSurface, Surface, show_nothing, tight_frame
 from .unseen_depth import depth_behind
-
-_LITTLE = 0.1
-"""Weight of what brightness tells, beside stereo's points: with less, asking again moves nothing."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -84,10 +78,9 @@ def fit_surface(
         scene = carried(scene, views, region, frame_from_object)
         distance = start(scene, radius, config.levels[0])
     total = sum(config.steps) + 10 * (len(config.levels) + 1)  # detail is one more
-    done, rendered, taken_back = 0, 0, 0
+    done, rendered, taken_back, last = 0, 0, 0, len(config.levels) - 1
     told: list[FarSide] = []
-    shown: list[ShownPlaces] = []
-    shares: list[float] = []
+    looks = Looks(scene=scene, config=config.linear, deadline=deadline)
     for level, (wanted, rounds, steps) in enumerate(
         zip(config.levels, config.rounds, config.steps, strict=True)
     ):
@@ -102,18 +95,16 @@ def fit_surface(
             far = far_sides(scene, distance) if is_second else []
             told += far
             before = refined(distance, nodes)
-            so_far = _told_last(shown)
-            linear, looks = _by_texture(config, level, scene, before, so_far, shares)
-            tell = within(progress, done / total, (done + 10) / total)
-            looks_s: list[float] = []
-            ask = _asking(scene, config.linear, shown, looks, deadline, began_s, looks_s, tell)
+            spent_s = looks.seconds
+            linear, num_looks = looks.planned(before, _looks_wanted(config, level), is_last=level == last)
+            ask = looks.on_grid(num_looks, within(progress, done / total, (done + 10) / total))
             distance = fit_level(
-                scene, before, radius, rounds, linear, far=far, told=so_far, ask=ask, looks=looks
+                scene, before, radius, rounds, linear, far=far, told=looks.told, ask=ask, looks=num_looks
             )
         done += 10
         show(Surface(distance=distance.cpu().numpy(), grid_from_world=frame.object_from_world))
         # looks take as long on any grid, and are left out where time is short
-        costs.append(GridCost(nodes=nodes, seconds=clock() - began_s - sum(looks_s)))
+        costs.append(GridCost(nodes=nodes, seconds=clock() - began_s - (looks.seconds - spent_s)))
         if steps:
             tell = within(progress, done / total, (done + steps) / total)
             better = refine(scene, distance, steps, config.render, generator, tell, deadline)
@@ -135,7 +126,7 @@ def fit_surface(
         *_decisions(scene, frame, config, depth, nodes=len(distance), rendered=rendered),
         of_detail,
         decision(told),
-        of_brightness(shares, shown),
+        *looks.decisions,
         _of_rendering(config, rendered, taken_back),
     )
     if config.budget_s is not None:
@@ -153,68 +144,11 @@ def _in_time(last: GridCost, rounds: int, deadline: Deadline, nodes: int) -> boo
     return PESSIMISM * last.seconds / rounds * (nodes / last.nodes) ** 3 <= deadline.left_s()
 
 
-def _told_last(shown: Sequence[ShownPlaces]) -> ShownPlaces | None:
-    """What brightness told at the last look; None if nothing."""
-    return shown[-1] if shown and len(shown[-1].weights) else None
-
-
-def _by_texture(
-    config: TrainConfig,
-    level: int,
-    scene: Measurements,
-    before: Float[Tensor, "nodes nodes nodes"],
-    told: ShownPlaces | None,
-    shares: list[float],
-) -> tuple[LinearConfig, int]:
-    """How a grid is fitted, and how often brightness is asked there.
-
-    It is asked if enough of the surface so far is not textured; how much is, is kept in `shares`. What it
-    `told` on the grid before is led by it on the last one.
-    """
+def _looks_wanted(config: TrainConfig, level: int) -> int:
     first, between, last = config.looks
-    is_last = level == len(config.levels) - 1
-    looks = last if is_last else between if level else first
-    if not looks:
-        return config.linear, 0
-    shares.append(textured(scene, before))
-    if shares[-1] > MOSTLY_TEXTURED:
-        return for_textured(config.linear), 0
-    linear = config.linear
-    if told is not None and is_last:
-        linear = for_plain(linear, shares[-1], share_told(told, before))
-    return linear, looks if config.linear.brightness else 0
-
-
-def _asking(
-    scene: Measurements,
-    config: LinearConfig,
-    shown: list[ShownPlaces],
-    looks: int,
-    deadline: Deadline,
-    began_s: float,
-    looks_s: list[float],
-    progress: Progress,
-) -> Ask:
-    """Asks brightness, `looks` times while there is time, and keeps what it answers in `shown`.
-
-    How long each look took is kept in `looks_s`.
-    Once if that weighs little: beside texture it does not, and each look takes as long as a round of the fit.
-    """
-    before = len(shown)
-
-    def ask(distance: Float[Tensor, "nodes nodes nodes"]) -> ShownPlaces | None:
-        if len(shown) > before and weight_beside(shown[-1], scene, config) < _LITTLE:
-            return None
-        # a look and a round take less than the fit did until here
-        asked_s = deadline.clock()
-        if deadline.left_s() < asked_s - began_s:
-            return None
-        progress((len(shown) - before) / looks, "looking where photographs are equally bright")
-        shown.append(shared_brightness(scene, distance, may_shine=config.may_shine))
-        looks_s.append(deadline.clock() - asked_s)
-        return _told_last(shown)
-
-    return ask
+    if level == len(config.levels) - 1:
+        return last
+    return between if level else first
 
 
 def _of_budget(

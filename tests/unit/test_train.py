@@ -29,7 +29,7 @@ from backend.scene import (
     transform_points,
     within,
 )
-from backend.stages import train
+from backend.stages import looks, train
 from backend.stages.linear_fit import LinearConfig, fit_level
 from backend.stages.measurements import Measurements
 from backend.stages.mesh import MeshConfig, extract_mesh, level_set, preview_mesh
@@ -373,9 +373,9 @@ def test_long_looks_are_not_taken_for_the_cost_of_a_grid(monkeypatch: pytest.Mon
         now_s[0] += 100.0
         return two_places(torch.ones(2))
 
-    monkeypatch.setattr(train, "textured", lambda scene, distance: 0.35)
-    monkeypatch.setattr(train, "weight_beside", lambda *asked: 1.0)
-    monkeypatch.setattr(train, "shared_brightness", long_look)
+    monkeypatch.setattr(looks, "textured", lambda scene, distance: 0.35)
+    monkeypatch.setattr(looks, "weight_beside", lambda *asked: 1.0)
+    monkeypatch.setattr(looks, "shared_brightness", long_look)
     config = TrainConfig(
         levels=(32, 56, 64), rounds=(2, 2, 2), steps=(0, 0, 0), looks=(0, 2, 0), budget_s=350.0
     )
@@ -405,8 +405,8 @@ def test_the_last_grid_of_a_plain_subject_is_fitted_as_such(monkeypatch: pytest.
         return fit_level(scene, before, *args, **words)
 
     monkeypatch.setattr(train, "fit_level", spy)
-    monkeypatch.setattr(train, "textured", lambda scene, distance: 0.35)
-    monkeypatch.setattr(train, "share_told", lambda told, distance: 0.035)
+    monkeypatch.setattr(looks, "textured", lambda scene, distance: 0.35)
+    monkeypatch.setattr(looks, "share_told", lambda told, distance: 0.035)
     config = TrainConfig(levels=(16, 20, 24, 32), rounds=(3, 3, 3, 3), steps=(0, 0, 0, 0), looks=(0, 1, 1))
     subject, unknown = (masked_scene(), true_region(), masked_stereo()), (open_scene(), ROOMY, open_stereo())
     nothing = places.chosen(places.weights < 0)
@@ -415,7 +415,7 @@ def test_the_last_grid_of_a_plain_subject_is_fitted_as_such(monkeypatch: pytest.
         (subject, nothing, 0, 1),
         (unknown, places, 2, 1 - 0.75 * 0.5),
     ):
-        monkeypatch.setattr(train, "shared_brightness", lambda *field, told=told, **how: told)
+        monkeypatch.setattr(looks, "shared_brightness", lambda *field, told=told, **how: told)
         heard.clear()
         fitted(*what, config)
         assert heard[-4:] == [(16, 1.0, 0), (20, 1.0, 0), (24, 1.0, num), (32, stereo, num)]
@@ -443,11 +443,14 @@ def test_doubtful_points_count_more_where_most_is_textured(monkeypatch: pytest.M
         (0.86, unasked, nobody, textured),
         (0.35, usual, lambda *field, **how: two_places(torch.ones(2)), [usual.confidence_power] * 3),
     ):
-        monkeypatch.setattr(train, "textured", lambda scene, distance, share=share: share)
-        monkeypatch.setattr(train, "shared_brightness", asked)
+        monkeypatch.setattr(looks, "textured", lambda scene, distance, share=share: share)
+        monkeypatch.setattr(looks, "shared_brightness", asked)
         powers.clear()
-        fitted(masked_scene(), true_region(), masked_stereo(), replace(config, linear=linear))
+        surface = fitted(masked_scene(), true_region(), masked_stereo(), replace(config, linear=linear))
         assert powers[-3:] == last
+        doubt = decision_on(surface, "doubtful points")
+        assert doubt.choice == f"weigh as their confidence to the power of {last[-1]:g}"
+        assert doubt.because == f"patches tell {share:.0%} of the surface"
 
 
 def test_what_hardly_weighs_is_asked_about_once_on_each_grid(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -455,10 +458,10 @@ def test_what_hardly_weighs_is_asked_about_once_on_each_grid(monkeypatch: pytest
     asked = [0]
     views, region, stereo = masked_scene(), true_region(), masked_stereo()
     measured = float((torch.tensor(stereo.points.confidence) ** 3).sum())
-    monkeypatch.setattr(train, "textured", lambda scene, distance: 0.35)
+    monkeypatch.setattr(looks, "textured", lambda scene, distance: 0.35)
     config = TrainConfig(levels=(16, 24, 32), rounds=(3, 5, 5), steps=(0, 0, 0), looks=(0, 3, 2))
     config = replace(config, linear=LinearConfig(settled=0.0))
-    for share, looks in ((0.05, 1 + 1), (0.2, 3 + 2)):
+    for share, times in ((0.05, 1 + 1), (0.2, 3 + 2)):
         told = two_places(torch.full((2,), share * measured / 2))
 
         def counted(*field: Any, told: ShownPlaces = told, **how: Any) -> ShownPlaces:
@@ -466,6 +469,6 @@ def test_what_hardly_weighs_is_asked_about_once_on_each_grid(monkeypatch: pytest
             return told
 
         asked[0] = 0
-        monkeypatch.setattr(train, "shared_brightness", counted)
+        monkeypatch.setattr(looks, "shared_brightness", counted)
         fitted(views, region, stereo, config)
-        assert asked[0] == looks
+        assert asked[0] == times
