@@ -40,10 +40,11 @@ test: .venv/.ready .venv-blender/.ready
 
 # A Blender with settings of its own: the tests install the extension, and must not touch the user's.
 # BLENDER may be several words; what it needs to be told is in the environment.
-IN_BLENDER = FEWVIEW_PYTHON=$(abspath $(BACKEND)) BLENDER_USER_RESOURCES=$(abspath build/blender-settings) $(BLENDER)
+SETTINGS := build/blender-settings
+IN_BLENDER = FEWVIEW_PYTHON=$(abspath $(BACKEND)) BLENDER_USER_RESOURCES=$(abspath $(SETTINGS)) $(BLENDER)
 
 test-blender: .venv/.ready build/pytest/.ready
-	rm -rf build/blender-settings && mkdir -p build/blender-settings
+	rm -rf $(SETTINGS) && mkdir -p $(SETTINGS)
 	$(IN_BLENDER) --background --factory-startup --python-exit-code 1 \
 	    --python tests/blender/run_in_blender.py -- build/pytest $(TESTS)
 
@@ -51,7 +52,7 @@ extension: .venv-blender/.ready
 	$(BPY) tests/blender/build_extension.py --output build
 
 screenshots: .venv/.ready extension
-	rm -rf build/blender-settings && mkdir -p build/blender-settings
+	rm -rf $(SETTINGS) && mkdir -p $(SETTINGS)
 	$(IN_BLENDER) --command extension install-file --repo user_default --enable build/fewview-*.zip
 	$(IN_BLENDER) --factory-startup --python docs/take_screenshots.py -- --output docs/images
 
