@@ -20,7 +20,7 @@ class Looks:
     """Those of one fit, grid by grid."""
 
     scene: Measurements
-    config: LinearConfig
+    linear: LinearConfig
     deadline: Deadline
     seconds: float = 0.0
     """That they took."""
@@ -40,7 +40,7 @@ class Looks:
         if not self.shares:
             return (decision(self.shares, self.shown),)
         mostly = self.shares[-1] > MOSTLY_TEXTURED
-        power = self.config.power_if_textured if mostly else self.config.confidence_power
+        power = self.linear.power_if_textured if mostly else self.linear.confidence_power
         doubt = Decision(
             what="doubtful points",
             choice=f"weigh as their confidence to the power of {power:g}",
@@ -56,14 +56,14 @@ class Looks:
         None if most of the surface is textured. What was told on the grid before leads the last one.
         """
         if not wanted:
-            return self.config, 0
+            return self.linear, 0
         self.shares.append(textured(self.scene, before))
         if self.shares[-1] > MOSTLY_TEXTURED:
-            return for_textured(self.config), 0
-        linear = self.config
+            return for_textured(self.linear), 0
+        linear = self.linear
         if self.told is not None and is_last:
             linear = for_plain(linear, self.shares[-1], share_told(self.told, before))
-        return linear, wanted if self.config.brightness else 0
+        return linear, wanted if self.linear.brightness else 0
 
     def on_grid(self, wanted: int, progress: Progress) -> Ask:
         """Asks up to `wanted` times while there is time.
@@ -73,14 +73,14 @@ class Looks:
         before, began_s = len(self.shown), self.deadline.clock()
 
         def ask(distance: Float[Tensor, "nodes nodes nodes"]) -> ShownPlaces | None:
-            if len(self.shown) > before and weight_beside(self.shown[-1], self.scene, self.config) < _LITTLE:
+            if len(self.shown) > before and weight_beside(self.shown[-1], self.scene, self.linear) < _LITTLE:
                 return None
             # a look and a round take less than the fit did until here
             asked_s = self.deadline.clock()
             if self.deadline.left_s() < asked_s - began_s:
                 return None
             progress((len(self.shown) - before) / wanted, "looking where photographs are equally bright")
-            self.shown.append(shared_brightness(self.scene, distance, may_shine=self.config.may_shine))
+            self.shown.append(shared_brightness(self.scene, distance, may_shine=self.linear.may_shine))
             self.seconds += self.deadline.clock() - asked_s
             return self.told
 

@@ -80,7 +80,7 @@ def fit_surface(
     total = sum(config.steps) + 10 * (len(config.levels) + 1)  # detail is one more
     done, rendered, taken_back, last = 0, 0, 0, len(config.levels) - 1
     told: list[FarSide] = []
-    looks = Looks(scene=scene, config=config.linear, deadline=deadline)
+    looks = Looks(scene=scene, linear=config.linear, deadline=deadline)
     for level, (wanted, rounds, steps) in enumerate(
         zip(config.levels, config.rounds, config.steps, strict=True)
     ):
