@@ -35,15 +35,18 @@ class Looks:
         return self.shown[-1] if self.shown and len(self.shown[-1].weights) else None
 
     @property
+    def _mostly_textured(self) -> bool:
+        return self.shares[-1] > MOSTLY_TEXTURED
+
+    @property
     def decisions(self) -> tuple[Decision, ...]:
         """What was made of texture, and what brightness was worth."""
         if not self.shares:
             return (decision(self.shares, self.shown),)
-        mostly = self.shares[-1] > MOSTLY_TEXTURED
-        power = self.linear.power_if_textured if mostly else self.linear.confidence_power
+        linear = for_textured(self.linear) if self._mostly_textured else self.linear
         doubt = Decision(
             what="doubtful points",
-            choice=f"weigh as their confidence to the power of {power:g}",
+            choice=f"weigh as their confidence to the power of {linear.confidence_power:g}",
             because=f"patches tell {self.shares[-1]:.0%} of the surface",
         )
         return (doubt, decision(self.shares, self.shown))
@@ -58,7 +61,7 @@ class Looks:
         if not wanted:
             return self.linear, 0
         self.shares.append(textured(self.scene, before))
-        if self.shares[-1] > MOSTLY_TEXTURED:
+        if self._mostly_textured:
             return for_textured(self.linear), 0
         linear = self.linear
         if self.told is not None and is_last:
