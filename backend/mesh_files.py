@@ -56,7 +56,7 @@ class MeshFileError(ValueError):
 def write_mesh(path: Path, mesh: SurfaceMesh) -> None:
     """Write mesh.ply: binary PLY with normals, colours and `support` at each vertex.
 
-    The faces of a mesh with a texture have coordinates in it, which write_texture writes beside.
+    The faces of a mesh with a texture have coordinates in it; texture.png is to lie beside, `png_of` it.
     """
     vertices = _vertex_table(_MESH_VERTEX, mesh.vertices, mesh.normals, mesh.colours_srgb)
     vertices["support"] = mesh.support
@@ -96,11 +96,6 @@ def read_mesh(path: Path) -> SurfaceMesh:
     )
 
 
-def write_texture(path: Path, texture: Texture) -> None:
-    """Write texture.png."""
-    path.write_bytes(_png(texture))
-
-
 def _read_texture(path: Path, coordinates: Float32[np.ndarray, "faces 3 2"]) -> Texture:
     try:
         with Image.open(path) as file:
@@ -121,7 +116,8 @@ def _coordinates(texture: Texture, *, y_down: bool) -> Float32[np.ndarray, "face
     return shares.astype(np.float32)
 
 
-def _png(texture: Texture) -> bytes:
+def png_of(texture: Texture) -> bytes:
+    """The picture as a file, texture.png beside a PLY."""
     file = io.BytesIO()
     # the last tenth of the size takes most of the time
     Image.fromarray(texture.image_srgb).save(file, "PNG", compress_level=3)
@@ -179,9 +175,10 @@ def read_sparse(
     return positions, np.unpackbits(seen, axis=1, count=num_photos, bitorder="little").astype(bool)
 
 
-def write_glb(path: Path, mesh: SurfaceMesh) -> None:
+def write_glb(path: Path, mesh: SurfaceMesh, texture_png: bytes | None = None) -> None:
     """Write a binary glTF 2.0: y up, the custom attribute `_SUPPORT`, and the texture or, without one,
     linear vertex colours. Where charts of the texture meet there are two vertices in place of one.
+    `texture_png` is `png_of` the texture, if that is made already: it takes longer than all else here.
 
     Positions are in single precision, so those of a mesh far from the origin are relative to its middle,
     which the node's translation holds in double precision.
@@ -200,7 +197,7 @@ def write_glb(path: Path, mesh: SurfaceMesh) -> None:
         vertex, coordinates, corners = _split_at_seams(mesh.faces, _coordinates(mesh.texture, y_down=True))
         attributes = {name: values[vertex] for name, values in attributes.items()}
         attributes["TEXCOORD_0"] = coordinates.astype("<f4")
-        picture = _png(mesh.texture)
+        picture = texture_png or png_of(mesh.texture)
     indices = corners.astype("<u4").ravel()
     binary = b"".join(array.tobytes() for array in (*attributes.values(), indices)) + picture
     structure = json.dumps(_gltf(attributes, indices, len(picture), middle), separators=(",", ":")).encode()

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from .errors import ErrorCode, ReconstructionError
 from .maths.sampling import mean_colours
-from .mesh_files import SPARSE, TEXTURE, write_glb, write_mesh, write_points, write_sparse, write_texture
+from .mesh_files import SPARSE, TEXTURE, png_of, write_glb, write_mesh, write_points, write_sparse
 from .records import save_record
 from .scene import Region, SolvedCameras
 from .stages.camera_report import CameraReport, camera_report_html, camera_report_numbers
@@ -34,16 +34,17 @@ def write_all(
     Pages about other cameras, which an earlier run left, are removed.
     """
     inputs = report.inputs
+    texture_png = None if inputs.mesh.texture is None else png_of(inputs.mesh.texture)
     writers: Writers = {
         "mesh.ply": partial(write_mesh, mesh=inputs.mesh),
-        "mesh.glb": partial(write_glb, mesh=inputs.mesh),
+        "mesh.glb": partial(write_glb, mesh=inputs.mesh, texture_png=texture_png),
         "points.ply": partial(write_points, points=inputs.points, region=inputs.region),
         **_camera_writers(inputs.solved, inputs.region),
         "report.json": _text(_json(report_numbers(report))),
         "report.html": _text(render_report_html(report)),
     }
-    if inputs.mesh.texture is not None:
-        writers[TEXTURE] = partial(write_texture, texture=inputs.mesh.texture)
+    if texture_png is not None:
+        writers[TEXTURE] = partial(Path.write_bytes, data=texture_png)
     if radiance is not None:
         writers[RADIANCE] = partial(save_record, record=radiance, hint=Radiance)
     outdated = () if workspace.frame == frame else _CAMERA_PAGES

@@ -7,6 +7,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from ..loading import packages_that_stay
 from ..point_methods import PointMethod
 from ..wire import protocol
 from .argument_types import seed
@@ -54,7 +55,8 @@ def fit_points_command(parsed: argparse.Namespace) -> int:
 
 def _fit(parsed: argparse.Namespace, listener: "Listener") -> "Outcome":
     """Raises ReconstructionError for what the user can mend, and Cancelled; then nothing is written."""
-    from ..maths.metrics import load_truth  # torch may be missing, and --help must still work
+    with packages_that_stay():
+        from ..maths.metrics import load_truth  # torch may be missing, and --help must still work
     from ..workspace import open_workspace
 
     catch_signals()

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 from ..errors import Cancelled, ErrorCode, ReconstructionError
 from ..failures import explain_or_none, internal_error
+from ..loading import packages_that_stay
 from ..version import VERSION
 from ..wire import protocol
 from ..wire.speaker import Speaker, speaker
@@ -111,7 +112,8 @@ def settle(
 
 def run_job(job: protocol.Job, base: Path, listener: "Listener") -> "Outcome":
     """Reconstruct into the job's output folder."""
-    from .. import pipeline  # torch may be missing, and doctor must still start
+    with packages_that_stay():
+        from .. import pipeline  # torch may be missing, and doctor must still start
     from ..workspace import open_workspace
 
     catch_signals()

@@ -5,6 +5,7 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from ..loading import packages_that_stay
 from ..wire import protocol
 from .cancelling import catch_signals
 from .reconstruct import converse_or_show
@@ -42,8 +43,9 @@ def render(parsed: argparse.Namespace) -> int:
 
 
 def _render(parsed: argparse.Namespace, listener: "Listener") -> "Outcome":
-    from ..pipeline import Outcome  # torch may be missing, and doctor must still start
-    from ..rendering import render_job
+    with packages_that_stay():
+        from ..pipeline import Outcome  # torch may be missing, and doctor must still start
+        from ..rendering import render_job
     from ..workspace import StageCost
 
     catch_signals()

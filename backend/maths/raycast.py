@@ -7,6 +7,7 @@ distance and the place inside the triangle are then computed in double precision
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from embreex.mesh_construction import TriangleMesh
@@ -45,18 +46,55 @@ class RayHits:
 
 @dataclass(frozen=True, kw_only=True)
 class MeshImage:
-    """A mesh as a camera sees it, without light or shading."""
+    """A mesh as a camera sees it, without light or shading; pictures of it are made when asked for."""
 
-    colour_srgb: Float32[np.ndarray, "height width 3"]
-    """Of the texture or, without one, of the vertices; 0 where not covered."""
+    mesh: SurfaceMesh
     coverage: Bool[np.ndarray, "height width"]
     """True where the pixel's centre shows the mesh."""
-    depth: Float32[np.ndarray, "height width"]
-    """Along the optical axis, world units; infinite where not covered."""
-    normal_world: Float32[np.ndarray, "height width 3"]
-    """Unit, interpolated vertex normals; 0 where not covered."""
-    support: Float32[np.ndarray, "height width"]
-    """0 where not covered."""
+    face: Int64[np.ndarray, "covered"]
+    """That the covered pixels show, row by row."""
+    barycentric: Float64[np.ndarray, "covered 3"]
+    """Weights of its corners there."""
+    depths: Float64[np.ndarray, "covered"]
+    """Along the optical axis, world units."""
+
+    @cached_property
+    def colour_srgb(self) -> Float32[np.ndarray, "height width 3"]:
+        """Of the texture or, without one, of the vertices, 0 to 1; 0 where not covered."""
+        texture = self.mesh.texture
+        if texture is None:
+            return self._picture(self._interpolated(self.mesh.colours_srgb) / 255.0)
+        places = np.einsum("hk,hkd->hd", self.barycentric, texture.corners_px[self.face])
+        times = _texels_a_pixel(places, self.coverage)
+        texels = shrunk(texture.image_srgb, times)
+        return self._picture(bilinear(texels, places / times) / 255.0)
+
+    @cached_property
+    def depth(self) -> Float32[np.ndarray, "height width"]:
+        """Along the optical axis, world units; infinite where not covered."""
+        return self._picture(self.depths, beside=np.inf)
+
+    @cached_property
+    def normal_world(self) -> Float32[np.ndarray, "height width 3"]:
+        """Unit, interpolated vertex normals; 0 where not covered."""
+        normals = self._interpolated(self.mesh.normals)
+        lengths = np.linalg.norm(normals, axis=-1, keepdims=True)
+        return self._picture(normals / np.where(lengths > 0, lengths, 1.0))
+
+    @cached_property
+    def support(self) -> Float32[np.ndarray, "height width"]:
+        """0 where not covered."""
+        return self._picture(self._interpolated(self.mesh.support))
+
+    def _interpolated(self, values: np.ndarray) -> np.ndarray:
+        return interpolate(values, self.mesh.faces[self.face], self.barycentric)
+
+    def _picture(
+        self, values: Float[np.ndarray, "covered *channels"], beside: float = 0.0
+    ) -> Float32[np.ndarray, "height width *channels"]:
+        image = np.full((*self.coverage.shape, *values.shape[1:]), beside, np.float32)
+        image[self.coverage] = values
+        return image
 
 
 class RayCaster:
@@ -157,52 +195,23 @@ def render_mesh(mesh: SurfaceMesh, camera: Camera, *, caster: RayCaster | None =
     hit, shape = hits.hit, (camera.height, camera.width)
     coverage = np.zeros(shape, bool)
     coverage[window] = hit.reshape(coverage[window].shape)
-    corners, weights = mesh.faces[hits.face[hit]], hits.barycentric[hit]
-
-    def picture(
-        values: Float[np.ndarray, "covered *channels"], beside: float = 0.0
-    ) -> Float32[np.ndarray, "height width *channels"]:
-        image = np.full((*shape, *values.shape[1:]), beside, np.float32)
-        image[coverage] = values
-        return image
-
-    normals = interpolate(mesh.normals, corners, weights)
-    lengths = np.linalg.norm(normals, axis=-1, keepdims=True)
-    depth = (hits.distance[hit, None] * directions[hit]) @ camera.camera_from_world[2, :3]
+    along = directions[hit] @ camera.camera_from_world[2, :3]
     return MeshImage(
-        colour_srgb=_colours(mesh, hits.face[hit], weights, coverage),
+        mesh=mesh,
         coverage=coverage,
-        depth=picture(depth, beside=np.inf),
-        normal_world=picture(normals / np.where(lengths > 0, lengths, 1.0)),
-        support=picture(interpolate(mesh.support, corners, weights)),
+        face=hits.face[hit],
+        barycentric=hits.barycentric[hit],
+        depths=hits.distance[hit] * along,
     )
 
 
-def _colours(
-    mesh: SurfaceMesh,
-    face: Int64[np.ndarray, "hits"],
-    weights: Float64[np.ndarray, "hits 3"],
-    coverage: Bool[np.ndarray, "height width"],
-) -> Float32[np.ndarray, "height width 3"]:
-    """sRGB, 0 to 1, where the picture is covered by these places of faces; else 0."""
-    colours = np.zeros((*coverage.shape, 3), np.float32)
-    if mesh.texture is None:
-        colours[coverage] = interpolate(mesh.colours_srgb, mesh.faces[face], weights) / 255.0
-        return colours
-    places = np.zeros((*coverage.shape, 2))
-    places[coverage] = np.einsum("hk,hkd->hd", weights, mesh.texture.corners_px[face])
-    times = _texels_a_pixel(places, coverage)
-    texels = shrunk(mesh.texture.image_srgb, times)
-    colours[coverage] = bilinear(texels, places[coverage] / times) / 255.0
-    return colours
-
-
 def _texels_a_pixel(
-    places: Float64[np.ndarray, "height width 2"], coverage: Bool[np.ndarray, "height width"]
+    places: Float64[np.ndarray, "covered 2"], coverage: Bool[np.ndarray, "height width"]
 ) -> int:
     """How many texels most pixels are apart: where they are several, their mean is what a pixel shows."""
-    both = coverage[:, 1:] & coverage[:, :-1]
-    apart = np.linalg.norm(np.diff(places, axis=1)[both], axis=-1)
+    rows, columns = np.nonzero(coverage)
+    beside = (np.diff(columns) == 1) & (np.diff(rows) == 0)
+    apart = np.linalg.norm(np.diff(places, axis=0)[beside], axis=-1)
     return max(1, round(float(np.median(apart)))) if len(apart) else 1
 
 

@@ -64,39 +64,39 @@ def picture(image_srgb: Float[np.ndarray, "height width 3"], size: tuple[int, in
 
 
 def before_backdrop(
-    image_srgb: Float[np.ndarray, "height width 3"], coverage: Bool[np.ndarray, "height width"]
-) -> Float[np.ndarray, "height width 3"]:
-    """The covered pixels before a light grey backdrop, a little darker at its foot."""
+    colours_srgb: Float[np.ndarray, "covered 3"], coverage: Bool[np.ndarray, "height width"]
+) -> Float32[np.ndarray, "height width 3"]:
+    """The covered pixels, row by row, before a light grey backdrop, a little darker at its foot."""
     top, foot = np.array([0.945, 0.950, 0.957]), np.array([0.835, 0.845, 0.860])
-    share = np.linspace(0, 1, len(coverage))[:, None, None]
-    return np.where(coverage[..., None], image_srgb, top + share * (foot - top))
+    image = np.empty((*coverage.shape, 3), np.float32)
+    image[:] = top + np.linspace(0, 1, len(coverage))[:, None, None] * (foot - top)
+    image[coverage] = colours_srgb
+    return image
 
 
-def clay(image: MeshImage, camera: Camera) -> Float64[np.ndarray, "height width 3"]:
+def clay(image: MeshImage, camera: Camera) -> Float32[np.ndarray, "height width 3"]:
     """The mesh as unpainted clay under a key light from the upper left and a fill light."""
     normals, from_behind = _towards_camera(image, camera)
-    surface = np.where(from_behind[..., None], INSIDE_LINEAR, CLAY_LINEAR)
+    surface = np.where(from_behind[:, None], INSIDE_LINEAR, CLAY_LINEAR)
     key, fill = (np.maximum(normals @ light, 0.0) for light in (KEY_LIGHT, FILL_LIGHT))
-    sky = 0.5 - 0.5 * normals[..., 1]
+    sky = 0.5 - 0.5 * normals[:, 1]
     light = 0.05 + 0.95 * key + 0.16 * fill + 0.14 * sky
-    return np.asarray(
-        before_backdrop(srgb_from_linear(surface * light[..., None]).clip(0, 1), image.coverage)
-    )
+    return before_backdrop(srgb_from_linear(surface * light[:, None]).clip(0, 1), image.coverage)
 
 
 def value_map(
     image: MeshImage, camera: Camera, stops_srgb: Float[np.ndarray, "stops 3"]
-) -> Float64[np.ndarray, "height width 3"]:
+) -> Float32[np.ndarray, "height width 3"]:
     """The mesh in the colours of its `support` (0 first stop, 1 last), shaded lightly to show its shape."""
     normals, _ = _towards_camera(image, camera)
     shade = 0.62 + 0.38 * np.maximum(normals @ KEY_LIGHT, 0.0) ** 0.8
-    colours = colour_at(image.support, stops_srgb)
-    return np.asarray(before_backdrop(colours * shade[..., None], image.coverage))
+    colours = colour_at(image.support[image.coverage], stops_srgb)
+    return before_backdrop(colours * shade[:, None], image.coverage)
 
 
 def colour_at(
-    values: Float[np.ndarray, "height width"], stops_srgb: Float[np.ndarray, "stops 3"]
-) -> Float64[np.ndarray, "height width 3"]:
+    values: Float[np.ndarray, "values"], stops_srgb: Float[np.ndarray, "stops 3"]
+) -> Float64[np.ndarray, "values 3"]:
     """Colours between evenly spaced stops for values from 0 to 1; values beyond keep the end's colour."""
     positions = np.linspace(0, 1, len(stops_srgb))
     return np.stack([np.interp(values, positions, channel) for channel in stops_srgb.T], axis=-1)
@@ -174,11 +174,11 @@ def _direction(vector: Float64[np.ndarray, "3"]) -> Float64[np.ndarray, "3"]:
 
 def _towards_camera(
     image: MeshImage, camera: Camera
-) -> tuple[Float32[np.ndarray, "height width 3"], Bool[np.ndarray, "height width"]]:
-    """Normals in the camera's frame, turned to the camera's side, and where they had to be turned."""
-    normals = image.normal_world @ camera.camera_from_world[:3, :3].T.astype(np.float32)
-    rows, columns = np.mgrid[: camera.height, : camera.width] + 0.5
-    x, y = (columns - camera.cx_px) / camera.fx_px, (rows - camera.cy_px) / camera.fy_px
-    away = (normals[..., 0] * x + normals[..., 1] * y + normals[..., 2]) / np.sqrt(x**2 + y**2 + 1)
+) -> tuple[Float32[np.ndarray, "covered 3"], Bool[np.ndarray, "covered"]]:
+    """Of the covered pixels: normals in the camera's axes, turned towards it, and which had to be turned."""
+    normals = image.normal_world[image.coverage] @ camera.camera_from_world[:3, :3].T.astype(np.float32)
+    rows, columns = np.nonzero(image.coverage)
+    x, y = (columns + 0.5 - camera.cx_px) / camera.fx_px, (rows + 0.5 - camera.cy_px) / camera.fy_px
+    away = (normals[:, 0] * x + normals[:, 1] * y + normals[:, 2]) / np.sqrt(x**2 + y**2 + 1)
     from_behind = away > BEHIND_COSINE
-    return np.where(from_behind[..., None], -normals, normals), from_behind
+    return np.where(from_behind[:, None], -normals, normals), from_behind

@@ -6,15 +6,19 @@
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
+import torch
 import trimesh
 from jaxtyping import Float32
 
 from ..images import fitted_size, resized
+from ..kernels.side_by_side import side_by_side
 from ..maths.metrics import (
     ErrorAgainstTruth,
     SurfaceError,
@@ -35,12 +39,25 @@ from ..report_page.pictures import (
     value_map,
 )
 from ..report_page.template import filled
-from ..scene import Camera, Decision, Progress, Region, SolvedCameras, SurfaceMesh, SurfacePoints, View
+from ..scene import (
+    Camera,
+    Decision,
+    Progress,
+    Region,
+    SolvedCameras,
+    SurfaceMesh,
+    SurfacePoints,
+    View,
+    within,
+)
 
 GUESSED_BELOW, MEASURED_FROM = 0.2, 0.6
 """Support of surface that counts as a guess, and of surface that counts as measured."""
 ERROR_MAP_LIMIT_PERCENT = 2.0
 """Of the true diagonal: where the error map's last colour begins."""
+
+Seen = TypeVar("Seen")
+Drawn = TypeVar("Drawn")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -155,34 +172,48 @@ def build_report(inputs: ReportInputs, config: ReportConfig, *, progress: Progre
     truth = load_truth(inputs.truth) if inputs.truth is not None else None
     mesh, views = inputs.mesh, inputs.solved.views
     caster = RayCaster(mesh.vertices, mesh.faces)
-    shown = set(_evenly(len(views), config.num_photos_shown))
-    photos = []
-    for index, view in enumerate(views):
-        progress(index / (len(views) + 2), f"comparing with {view.name}")
-        photos.append(_fit_photo(view, mesh, caster, config.picture_px, with_panels=index in shown))
-    progress(len(views) / (len(views) + 2), "drawing the mesh from other sides")
-    cameras = turntable_cameras(
-        [view.camera for view in views], mesh.vertices, config.num_turntable, 2 * config.picture_px
-    )
+    given = [view.camera for view in views]
+    shown = {views[index].name for index in _evenly(len(views), config.num_photos_shown)}
+
+    def fit_photo(view: View) -> PhotoFit:
+        return _fit_photo(view, mesh, caster, config.picture_px, with_panels=view.name in shown)
+
+    told = within(progress, 0.0, 0.6)
+    photos = _in_turn(fit_photo, views, told, lambda view: f"comparing with {view.name}")
     error: ErrorAgainstTruth | None = None
     drawn = mesh
     if truth is not None:
-        progress((len(views) + 1) / (len(views) + 2), "measuring against the truth")
+        progress(0.6, "measuring against the truth")
         seed, num_samples = inputs.seed, config.error_samples
-        given = [view.camera for view in views]
         error = surface_error(mesh, truth, cameras=given, seed=seed, num_samples=num_samples)
         # The error takes the place of the support, which is drawn in colours from 0 to 1.
         distance = vertex_error_percent(mesh, truth, seed=seed, num_samples=num_samples)
         drawn = replace(mesh, support=distance / np.float32(ERROR_MAP_LIMIT_PERCENT))
-    images = [render_mesh(drawn, camera, caster=caster) for camera in cameras]
+    cameras = turntable_cameras(given, mesh.vertices, config.num_turntable, 2 * config.picture_px)
+    draw = partial(_from_new_side, drawn, caster, with_error=error is not None)
+    told = within(progress, 0.7, 1.0)
+    sides = _in_turn(draw, list(enumerate(cameras, 1)), told, lambda _: "drawing the mesh from other sides")
     return Report(
         inputs=inputs,
         photos=tuple(photos),
         mesh=mesh_facts(mesh),
-        turntable=_turntable(images, cameras),
+        turntable=tuple(shape for shape, _ in sides),
         error=error,
-        error_maps=_error_maps(images, cameras) if error is not None else (),
+        error_maps=tuple(map_ for _, map_ in sides if map_ is not None),
     )
+
+
+def _in_turn(
+    draw: Callable[[Seen], Drawn], seen: Sequence[Seen], progress: Progress, doing: Callable[[Seen], str]
+) -> list[Drawn]:
+    """What is drawn of each, as many at a time as there are threads, with progress before each of these."""
+    threads = torch.get_num_threads()
+    drawn: list[Drawn] = []
+    while len(drawn) < len(seen):
+        first = len(drawn)
+        progress(first / len(seen), doing(seen[first]))
+        drawn += side_by_side(draw, seen[first : first + threads], threads)
+    return drawn
 
 
 def mesh_facts(mesh: SurfaceMesh) -> MeshFacts:
@@ -303,7 +334,7 @@ def _panels(
     name: str, photo: Float32[np.ndarray, "height width 3"], image: MeshImage, camera: Camera
 ) -> tuple[Picture, ...]:
     size = _page_size(camera)
-    painted = before_backdrop(image.colour_srgb, image.coverage)
+    painted = before_backdrop(image.colour_srgb[image.coverage], image.coverage)
     return (
         picture(photo, size, f"The photograph {name}"),
         picture(painted, size, f"The mesh in its colours, seen from where {name} was taken"),
@@ -316,22 +347,17 @@ def _panels(
     )
 
 
-def _turntable(images: Sequence[MeshImage], cameras: Sequence[Camera]) -> tuple[Picture, ...]:
-    return tuple(
-        picture(clay(image, camera), _page_size(camera), f"The mesh as grey clay from new side {number}")
-        for number, (image, camera) in enumerate(zip(images, cameras, strict=True), 1)
-    )
-
-
-def _error_maps(images: Sequence[MeshImage], cameras: Sequence[Camera]) -> tuple[Picture, ...]:
-    return tuple(
-        picture(
-            value_map(image, camera, ERROR_STOPS_SRGB),
-            _page_size(camera),
-            f"Distance of the mesh from the truth, from new side {number}",
-        )
-        for number, (image, camera) in enumerate(zip(images, cameras, strict=True), 1)
-    )
+def _from_new_side(
+    drawn: SurfaceMesh, caster: RayCaster, numbered: tuple[int, Camera], *, with_error: bool
+) -> tuple[Picture, Picture | None]:
+    """The mesh as clay and, where its support stands for the error, a map of that."""
+    number, camera = numbered
+    image, size = render_mesh(drawn, camera, caster=caster), _page_size(camera)
+    shape = picture(clay(image, camera), size, f"The mesh as grey clay from new side {number}")
+    if not with_error:
+        return shape, None
+    errors = value_map(image, camera, ERROR_STOPS_SRGB)
+    return shape, picture(errors, size, f"Distance of the mesh from the truth, from new side {number}")
 
 
 def _photo_numbers(photo: PhotoFit) -> dict[str, object]:

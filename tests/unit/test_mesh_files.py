@@ -9,13 +9,13 @@ import trimesh
 
 from backend.mesh_files import (
     MeshFileError,
+    png_of,
     read_mesh,
     read_sparse,
     write_glb,
     write_mesh,
     write_points,
     write_sparse,
-    write_texture,
 )
 from backend.scene import Region, SurfaceMesh, SurfacePoints, Texture
 
@@ -44,7 +44,7 @@ def textured_mesh(seed: int = 0) -> SurfaceMesh:
 def write_both(folder: Path, mesh: SurfaceMesh) -> Path:
     assert mesh.texture is not None
     write_mesh(folder / "mesh.ply", mesh)
-    write_texture(folder / "texture.png", mesh.texture)
+    (folder / "texture.png").write_bytes(png_of(mesh.texture))
     return folder / "mesh.ply"
 
 
@@ -193,6 +193,16 @@ def test_sparse_points_of_other_cameras_are_refused(tmp_path: Path) -> None:
     write_sparse(path, **points | {"positions": np.full((3, 3), np.nan)}, visibility=np.ones((3, 4), bool))
     with pytest.raises(MeshFileError, match="not finite"):
         read_sparse(path, num_photos=4)
+
+
+def test_a_picture_that_is_made_already_is_not_made_again(tmp_path: Path) -> None:
+    mesh = textured_mesh()
+    assert mesh.texture is not None
+    write_glb(tmp_path / "made.glb", mesh)
+    write_glb(tmp_path / "given.glb", mesh, png_of(mesh.texture))
+    assert (tmp_path / "made.glb").read_bytes() == (tmp_path / "given.glb").read_bytes()
+    write_glb(tmp_path / "other.glb", mesh, b"a picture of others")
+    assert b"a picture of others" in (tmp_path / "other.glb").read_bytes()
 
 
 def test_the_same_mesh_gives_the_same_bytes(tmp_path: Path) -> None:

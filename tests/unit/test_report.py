@@ -360,8 +360,10 @@ def test_progress_goes_forward_and_can_cancel(tmp_path: Path) -> None:
     fractions: list[float] = []
     inputs = with_truth(small_run(), tmp_path / "truth.ply", resolution=2)
     build_report(inputs, SMALL, progress=lambda fraction, _: fractions.append(fraction))
-    assert fractions == sorted(fractions)
-    assert len(set(fractions)) == 5
+    assert fractions == sorted(set(fractions))
+    assert len(fractions) >= 3, (
+        "photographs, the truth, and other sides, as many at a time as there are cores"
+    )
     assert 0 <= fractions[0] < fractions[-1] < 1
 
     def cancel(_fraction: float, _text: str) -> None:
@@ -528,12 +530,19 @@ def shift_by(offset: list[float]) -> np.ndarray:
 
 def lone_pixel(normal: tuple[float, float, float], support: float = 0.0) -> MeshImage:
     """What a camera at (0, -4, 0) sees in its single pixel; it looks along +y."""
+    face = SurfaceMesh(
+        vertices=np.eye(3),
+        faces=np.array([[0, 1, 2]]),
+        normals=np.array([normal] * 3, np.float32),
+        colours_srgb=np.zeros((3, 3), np.uint8),
+        support=np.full(3, support, np.float32),
+    )
     return MeshImage(
-        colour_srgb=np.zeros((1, 1, 3), np.float32),
+        mesh=face,
         coverage=np.ones((1, 1), bool),
-        depth=np.ones((1, 1), np.float32),
-        normal_world=np.array([[normal]], np.float32),
-        support=np.full((1, 1), support, np.float32),
+        face=np.array([0]),
+        barycentric=np.full((1, 3), 1 / 3),
+        depths=np.ones(1),
     )
 
 
