@@ -5,9 +5,11 @@ import math
 from dataclasses import dataclass, replace
 from functools import cache, partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import PIL.Image  # noqa: F401 - before pycolmap
+import pycolmap
 import pytest
 import torch
 import torch.nn.functional as F
@@ -100,11 +102,13 @@ def test_depth_through_very_short_and_very_long_lenses(
     assert np.median(np.abs(surface_distance(points))) < 0.0008 * diagonal()
 
 
-def ridge_from(focal_widths: float, *, told: bool = True) -> tuple[list[Photo], list[np.ndarray]]:
-    """Three photographs of the ridge, as large in each: a long lens from far away; and their cameras."""
+def ridge_from(
+    focal_widths: float, *, told: bool = True, angles_deg: tuple[float, ...] = (-18.0, 0.0, 15.0)
+) -> tuple[list[Photo], list[np.ndarray]]:
+    """Photographs of the ridge, as large in each: a long lens from far away; and their cameras."""
     focal_px = focal_widths * WIDTH
     poses = []
-    for angle_deg in (-18.0, 0.0, 15.0):
+    for angle_deg in angles_deg:
         pose = arc_pose(angle_deg)
         pose[:3, 3] *= focal_px / FOCAL_PX
         poses.append(pose)
@@ -148,6 +152,24 @@ def test_cameras_of_very_short_and_very_long_lenses_that_nothing_tells(
     monkeypatch.setattr(structure_from_motion, "_OTHER_FOCAL_FACTORS", ())
     usual_deg = worst_turn_deg(solve(workdir=tmp_path / "usual"), poses)
     assert (usual_deg > 20) == (focal_widths in (0.34, 105.0))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("focal_widths", [0.34, 1.05])
+def test_of_many_photographs_a_few_tell_the_lens(
+    focal_widths: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    photos, poses = ridge_from(focal_widths, told=False, angles_deg=(-18.0, -11.0, -4.0, 3.0, 9.0, 15.0))
+    mapped, tried = structure_from_motion._mapped, []
+
+    def counting(*given: Any) -> list[pycolmap.Reconstruction]:
+        tried.append(len(given[6]) if len(given) > 6 else 0)
+        return mapped(*given)
+
+    monkeypatch.setattr(structure_from_motion, "_mapped", counting)
+    solve = partial(solve_cameras, photos, None, CamerasConfig(), seed=0, progress=no_progress)
+    assert worst_turn_deg(solve(workdir=tmp_path / "ours"), poses) < 1.0
+    assert tried == [0, *4 * [structure_from_motion._FEW_PHOTOS]], "the usual lens and three others"
 
 
 @pytest.mark.slow

@@ -2,20 +2,22 @@
 
 import json
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 from itertools import combinations
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import PIL.Image  # noqa: F401 - before pycolmap
+import PIL.Image
 import pycolmap
 import pytest
 from scipy.ndimage import gaussian_filter
 from scipy.spatial.transform import Rotation
 
 from backend.errors import Cancelled, ErrorCode, ReconstructionError
-from backend.scene import Photo, SolvedCameras, no_progress
+from backend.scene import Decision, Photo, SolvedCameras, no_progress
+from backend.stages import structure_from_motion
 from backend.stages.camera_report import build_camera_report, camera_report_html, camera_report_numbers
 from backend.stages.cameras import CamerasConfig, solve_cameras
 from backend.stages.lens_refinement import Gaussian, joined, refine_lenses
@@ -181,6 +183,113 @@ def test_photographs_from_one_spot(focal_px: float | None, tmp_path: Path) -> No
     images = [render(look_at_origin(spot, turn)) for turn in (-7.0, 0.0, 6.0)]
     photos = [make_photo(f"{index}.png", image, focal_px) for index, image in enumerate(images)]
     assert refusal(photos, tmp_path) == ErrorCode.NO_PARALLAX
+
+
+def lens_kept(
+    few: dict[float, int], whole: dict[float, int], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> tuple[int, list[tuple[float, int]]]:
+    """Of models that are told apart by how many points they confirm: the one kept, and all that were made.
+
+    `few` and `whole` say that number for each focal length that the mapper begins with, of a few photographs
+    and of all; those made are (focal length, photographs).
+    """
+    PIL.Image.new("L", (64, 48)).save(tmp_path / "0000.png")
+    group = structure_from_motion.LensGroup(names=("0000.png",), width=64, height=48, focal_px=None)
+    structure_from_motion.register_pictures(tmp_path / "a.db", tmp_path, [group])
+    begun, made = [1.2], []
+    confirmed: dict[pycolmap.Reconstruction, int] = {}
+
+    def model_with(number: int) -> pycolmap.Reconstruction:
+        confirmed[model := pycolmap.Reconstruction()] = number
+        return model
+
+    def mapped(names: Sequence[str] = ()) -> list[pycolmap.Reconstruction]:
+        made.append((begun[-1], len(names) or 20))
+        return [model_with((few if names else whole)[begun[-1]])]
+
+    monkeypatch.setattr(structure_from_motion, "_begin_with", lambda _, __, factor: begun.append(factor))
+    monkeypatch.setattr(structure_from_motion, "_few_that_share_most", lambda _: ["0", "1"])
+    monkeypatch.setattr(structure_from_motion, "_merit", lambda model: (20, confirmed[model], 0))
+    kept = structure_from_motion._with_another_lens(model_with(whole[1.2]), tmp_path / "a.db", mapped)
+    assert kept is not None
+    assert begun[-1] == 1.2, "later attempts begin as usual"
+    return confirmed[kept], made
+
+
+FEW_PHOTOS = [(1.2, 2), (0.4, 2), (4.0, 2), (12.0, 2)]
+
+
+def test_a_few_photographs_say_that_no_other_lens_is_worth_all_of_them(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    few, whole = {1.2: 100, 0.4: 20, 4.0: 104, 12.0: 99}, {1.2: 500}
+    assert lens_kept(few, whole, tmp_path, monkeypatch) == (500, FEW_PHOTOS)
+
+
+@pytest.mark.parametrize(("with_all", "kept"), [(900, 900), (510, 500)])
+def test_where_a_few_say_another_lens_all_decide(
+    with_all: int, kept: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    few, whole = {1.2: 100, 0.4: 20, 4.0: 120, 12.0: 20}, {1.2: 500, 4.0: with_all}
+    made = [*FEW_PHOTOS[:3], (4.0, 20), *FEW_PHOTOS[3:]]
+    assert lens_kept(few, whole, tmp_path, monkeypatch) == (kept, made)
+
+
+@pytest.mark.parametrize(("num_photos", "num_draws"), [(3, 4), (12, 1)])
+def test_chance_is_drawn_again_for_few_photographs_and_else_until_all_are_confirmed(
+    num_photos: int, num_draws: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    drawn: list[int] = []
+
+    def match(_: Path, *, sensitive: bool, seed: int, **__: bool) -> None:
+        if sensitive:
+            drawn.append(seed)
+
+    def nothing(*_: Any, **__: Any) -> None:
+        pass
+
+    fakes = {
+        "register_pictures": nothing,
+        "extract_features": nothing,
+        "match_pictures": match,
+        "_mapped": lambda *_: [pycolmap.Reconstruction()],
+        "_with_another_lens": lambda model, *_: model,
+        "_is_enough": lambda *_: bool(drawn),
+        "_why_fainter": lambda *_: Decision(what="features", choice="fainter ones", because="there are more"),
+    }
+    for name, fake in fakes.items():
+        monkeypatch.setattr(structure_from_motion, name, fake)
+    names = tuple(f"{index:04d}.png" for index in range(num_photos))
+    group = structure_from_motion.LensGroup(names=names, width=64, height=48, focal_px=None)
+    structure_from_motion._best_model(tmp_path, [group], 1000, tmp_path, 7, no_progress)
+    assert drawn == list(range(7, 7 + num_draws))
+
+
+@pytest.mark.parametrize(("plenty", "is_fine"), [(1, False), (10**6, True)])
+def test_of_large_photographs_features_are_sought_finely_where_there_are_few(
+    plenty: int, is_fine: bool, corner: list[Photo], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    names = tuple(f"{index:04d}.png" for index in range(3))
+    for name, photo in zip(names, corner, strict=True):
+        grey = structure_from_motion.brightness(photo.image_srgb)
+        PIL.Image.fromarray(grey).save(tmp_path / name)
+    group = structure_from_motion.LensGroup(names=names, width=WIDTH, height=HEIGHT, focal_px=None)
+
+    def found(database: Path, few_pixels: int, fine_pixels: int) -> list[int]:
+        monkeypatch.setattr(structure_from_motion, "_FEW_PIXELS", few_pixels)
+        monkeypatch.setattr(structure_from_motion, "_FINE_PIXELS", fine_pixels)
+        structure_from_motion.register_pictures(database, tmp_path, [group])
+        structure_from_motion.extract_features(
+            database, tmp_path, [group], 5000, sensitive=False, progress=no_progress
+        )
+        with pycolmap.Database.open(database) as opened:
+            return [opened.num_keypoints_for_image(image.image_id) for image in opened.read_all_images()]
+
+    fine = found(tmp_path / "fine.db", 10**9, 10**9)
+    coarse = found(tmp_path / "coarse.db", 0, 0)
+    assert min(fine) > 1.5 * max(coarse)
+    monkeypatch.setattr(structure_from_motion, "_PLENTY", plenty)
+    assert found(tmp_path / "asked.db", 0, 10**9) == (fine if is_fine else coarse)
 
 
 def test_progress_can_cancel(corner: list[Photo], tmp_path: Path) -> None:
