@@ -40,6 +40,7 @@ _FEW_PIXELS = 6_000_000
 """Past so many, as of four large photographs, they are not where the first ones have plenty without: four to
 six of the fountain, with five thousand each, place each other as exactly so in a third of the time."""
 _PLENTY = 2_500
+"""Measured without: 4000 to 13 000 of what is textured, 900 to 1100 of a dark walnut, which needs them."""
 _PROBED = 2
 """Photographs that tell."""
 
@@ -238,16 +239,17 @@ def extract_features(
             database, folder, image_names=names, extraction_options=options, device=pycolmap.Device.cpu
         )
 
-    progress(0.0, "Finding features")
-    options.sift.first_octave = -1 if num_pixels <= _FINE_PIXELS else 0
-    if not sensitive and _FEW_PIXELS < num_pixels <= _FINE_PIXELS:
+    fine = num_pixels <= _FINE_PIXELS
+    if fine and not sensitive and num_pixels > _FEW_PIXELS:
+        progress(0.0, "Finding features")
         options.sift.first_octave = 0
         extract(names[:_PROBED])
-        if _fewest_features(database, _PROBED) < _PLENTY:
-            options.sift.first_octave = -1
+        fine = _fewest_features(database, _PROBED) < _PLENTY
+        if fine:
             with pycolmap.Database.open(database) as opened:
                 opened.clear_keypoints()
                 opened.clear_descriptors()
+    options.sift.first_octave = -1 if fine else 0
     for start in range(0, len(names), options.num_threads):
         progress(0.5 * start / len(names), "Finding features")
         # of those that have features already nothing is sought
