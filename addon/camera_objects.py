@@ -18,7 +18,7 @@ from mathutils import Matrix
 from numpy.typing import NDArray
 
 from ..backend.maths.upright import up_direction
-from ..backend.wire.photographs import is_named
+from ..backend.wire.photographs import is_named, is_of_phone
 from .camera_lens import apply_lens
 from .exif_orientation import clockwise_turn_deg
 from .intrinsics import Pinhole, aspect_pair, shared_aspect_or_none
@@ -86,9 +86,13 @@ def problems(wanted: CameraImport) -> tuple[str, ...]:
         found.append(
             "The photographs' pixels differ in shape, and a scene has one: some cameras show them distorted"
         )
-    missing = [c.name for c in solved.cameras if photograph_or_none(c.name, wanted.photographs) is None]
-    if missing:
+    files = {c.name: photograph_or_none(c.name, wanted.photographs) for c in solved.cameras}
+    if missing := [name for name, file in files.items() if file is None]:
         found.append(f"Not found, so not shown behind their cameras: {', '.join(missing)}")
+    if unread := [name for name, file in files.items() if file is not None and is_of_phone(file)]:
+        found.append(
+            f"HEIC, which Blender does not read, so not shown behind their cameras: {', '.join(unread)}"
+        )
     return tuple(found)
 
 
@@ -273,8 +277,11 @@ def _set_sizes(camera: bpy.types.Object, root: bpy.types.Object | None, solved: 
 
 
 def _show_behind(data: bpy.types.Camera, pinhole: Pinhole, photograph: Path | None) -> None:
-    """Show the photograph when looking through the camera; Blender reads the file when it first does."""
-    if photograph is None:
+    """Show the photograph when looking through the camera; Blender reads the file when it first does.
+
+    One that it does not read would be a picture of nothing.
+    """
+    if photograph is None or is_of_phone(photograph):
         return
     if not data.background_images:
         data.background_images.new()

@@ -18,6 +18,7 @@ DEPENDENCIES = {
     # pillow stands before pycolmap: imported the other way round, the two corrupt memory.
     "numpy": "numpy",
     "PIL": "pillow",
+    "pillow_heif": "pillow-heif",
     "tifffile": "tifffile",
     "scipy": "scipy",
     "skimage": "scikit-image",

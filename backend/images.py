@@ -14,6 +14,7 @@ import numpy as np
 import tifffile
 from jaxtyping import Float, Float32, Shaped
 from PIL import ExifTags, Image, UnidentifiedImageError
+from pillow_heif import register_heif_opener
 from scipy.sparse import csr_array
 
 from .errors import ErrorCode, ReconstructionError
@@ -49,7 +50,7 @@ class DecodedImage:
 def read_image(path: Path, max_side_px: int | None = None) -> DecodedImage:
     """The photograph in a file, upright, its longer side at most max_side_px.
 
-    JPEG, PNG, TIFF, WebP and BMP; grey, grey with alpha, palette, RGB, RGBA and CMYK; 8 and 16 bits
+    JPEG, HEIC, PNG, TIFF, WebP and BMP; grey, grey with alpha, palette, RGB, RGBA and CMYK; 8 and 16 bits
     a channel (of colour PNG with 16 bits the upper 8 are used).
     Raises ReconstructionError(PHOTO_UNREADABLE).
     """
@@ -142,6 +143,7 @@ def focal_px_or_none(exif: Image.Exif, width: int, height: int) -> float | None:
 def _decoded(path: Path) -> tuple[Shaped[np.ndarray, "height width *channels"], float | None]:
     """Pixels as stored, upright, and the focal length in pixels."""
     try:
+        register_heif_opener()  # Pillow has none of its own
         # Pillow warns of large and of damaged files; what it cannot read it raises as well.
         with warnings.catch_warnings(action="ignore"), Image.open(path) as file:
             exif = file.getexif()
@@ -191,8 +193,6 @@ def _plain_mode(file: Image.Image) -> Image.Image:
 def _refuse(path: Path, error: Exception) -> NoReturn:
     if not path.exists():
         text, remedy = f"There is no file {path}.", "Check the path."
-    elif path.suffix.lower() in (".heic", ".heif"):
-        text, remedy = f"{path.name} is a HEIC file, which cannot be read.", "Save it as JPEG first."
     else:
         text = f"{path.name} cannot be read: it is damaged, cut short or no picture ({error})."
         remedy = "Copy it again from the camera, or leave it out."

@@ -80,6 +80,7 @@ _PACKAGES = (
     "embreex",
     "fast-simplification",
     "pillow",
+    "pillow-heif",
 )
 """All that compute, or read photographs."""
 

@@ -50,6 +50,9 @@ _LEAST_CELLS = 1e-3
 _SHORTEST = 1e-6
 """Edges of a simplified mesh, in shares of its size: on sides that are exactly flat some have no length."""
 
+_MORE_FACES = 1.2
+"""Times as many as were asked for, where so few can not be closed; its square after that, and so on."""
+
 _LOOSE_REACHES = 5.0
 """How far surface goes on beyond what was measured, in what a measurement reaches, in a larger scene."""
 
@@ -276,10 +279,11 @@ def only_used(vertices: Vertices, faces: Faces) -> tuple[KeptVertices, Faces]:
 def simplified(vertices: Vertices, faces: Faces, max_faces: int) -> tuple[KeptVertices, KeptFaces]:
     """At most about `max_faces` faces by quadric edge collapse; a closed mesh stays closed.
 
-    Where the collapse would open a closed mesh, more faces are kept.
+    Where the collapse would open a closed mesh, more faces are kept: a few more, and where that does not
+    help, as of a foam, soon many more.
     """
     closed = trimesh.Trimesh(vertices, faces, process=False).is_watertight
-    target = max_faces
+    target, growth = max_faces, _MORE_FACES
     # single precision resolves a mesh of unit size at the origin best
     middle, size = vertices.mean(axis=0), float(np.ptp(vertices, axis=0).max())
     unit = ((vertices - middle) / size).astype(np.float32)
@@ -290,7 +294,7 @@ def simplified(vertices: Vertices, faces: Faces, max_faces: int) -> tuple[KeptVe
         fewer = without_short_edges(points.astype(np.float64), fewer.astype(np.int64), _SHORTEST)
         if not closed or trimesh.Trimesh(points, fewer, process=False).is_watertight:
             return only_used(points.astype(np.float64) * size + middle, fewer)
-        target = round(1.2 * target)
+        target, growth = round(growth * target), growth**2
     return vertices, faces
 
 

@@ -11,7 +11,7 @@ from jaxtyping import Float32
 from ..errors import ErrorCode, ReconstructionError
 from ..images import DecodedImage, read_image, resized, same_shape
 from ..scene import Photo, Progress
-from ..wire.photographs import first_names, names_of, photographs_in
+from ..wire.photographs import KINDS, first_names, names_of, photographs_in
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,7 +63,7 @@ def find_photos(sources: Sequence[Path]) -> list[Path]:
         places = ", ".join(str(source) for source in sources) or "the list"
         text = f"There are no photographs in {places}."
         raise ReconstructionError(
-            ErrorCode.NO_PHOTOS, text, "Give a folder with JPEG, PNG, TIFF, WebP or BMP files."
+            ErrorCode.NO_PHOTOS, text, f"Give a folder with photographs: {KINDS} can be read."
         )
     if len(found) == 1:
         text = "There is only one photograph."

@@ -25,6 +25,8 @@ NEIGHBOURS = 50
 """The distance to this neighbour is how far around a point queries are drawn (Ma et al.)."""
 _BALL = 0.5
 """Radius of the ball to begin with, in half sides of the cube."""
+_QUERIES = 200_000
+"""Drawn around the points, about."""
 _NODES_AT_ONCE = 65_536
 
 
@@ -150,11 +152,11 @@ def fit_network(
 
 
 def _draw_queries(points: Float[Tensor, "points 3"], share: float, generator: torch.Generator) -> Queries:
-    """About 200 000 places around the points, as far away as their neighbours are, and some anywhere."""
+    """Places around the points, as far away as their neighbours are, and some anywhere."""
     places = points.cpu().numpy()
     tree = nearest_tree(places)
     spread, _ = tree.query(places, k=[min(NEIGHBOURS, len(places) - 1) + 1], workers=-1)
-    times = max(1, 200_000 // len(places))
+    times = max(1, _QUERIES // len(places))
     widths = torch.tensor(spread[:, 0], dtype=points.dtype).repeat(times)
     noise = torch.randn((len(widths), 3), generator=generator, dtype=points.dtype)
     around = points.cpu().repeat(times, 1) + widths[:, None] * noise

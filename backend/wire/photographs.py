@@ -6,18 +6,32 @@ The backend names photographs by it, and who shows its results finds them again.
 from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
 
-SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp")
+_OF_PHONES = (".heic", ".heif")
+SUFFIXES = (".jpg", ".jpeg", *_OF_PHONES, ".png", ".tif", ".tiff", ".webp", ".bmp")
 """Of files that can be read, in small letters."""
+KINDS = "JPEG, HEIC, PNG, TIFF, WebP and BMP"
+"""The same in words."""
 _OTHER_SUFFIXES = frozenset(
-    {".heic", ".heif", ".avif", ".jxl", ".jp2", ".gif", ".exr", ".hdr", ".psd"}
+    {".avif", ".jxl", ".jp2", ".gif", ".exr", ".hdr", ".psd"}
     | {".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2"}
 )
 """Of pictures that cannot: phones and cameras write some of them beside those above."""
 
 
 def photographs_in(folder: Path) -> list[Path]:
-    """The photographs right in the folder. Raises OSError where it cannot be read."""
-    return [path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES and _is_visible_file(path)]
+    """The photographs right in the folder.
+
+    What a phone saved counts once where it lies beside a copy in another format, IMG_1.HEIC beside IMG_1.JPG:
+    the copy. Raises OSError where the folder cannot be read.
+    """
+    found = [path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES and _is_visible_file(path)]
+    copies = {path.stem for path in found if not is_of_phone(path)}
+    return [path for path in found if not (is_of_phone(path) and path.stem in copies)]
+
+
+def is_of_phone(path: Path) -> bool:
+    """Whether the file has a format that phones write and Blender does not read."""
+    return path.suffix.lower() in _OF_PHONES
 
 
 def passed_over(sources: Sequence[Path]) -> tuple[str, ...]:
@@ -34,10 +48,7 @@ def passed_over_text(names: Sequence[str]) -> str:
     """What to tell the user of pictures that were passed over; empty where there are none."""
     if not names:
         return ""
-    return (
-        "Passed over, because only JPEG, PNG, TIFF, WebP and BMP can be read: "
-        f"{first_names(names)}. Convert them to JPEG."
-    )
+    return f"Passed over, because only {KINDS} can be read: {first_names(names)}. Convert them to JPEG."
 
 
 def first_names(names: Sequence[str]) -> str:

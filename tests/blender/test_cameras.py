@@ -233,6 +233,20 @@ def test_photographs_are_behind_their_cameras(job: Path) -> None:
     assert not third.data.background_images  # there is no such file
 
 
+def test_a_photograph_that_blender_does_not_read_is_named_and_not_shown(part: Any, tmp_path: Path) -> None:
+    job = make_job(part, tmp_path / "reconstruct-001", estimated=True, names=("a.heic", "b.png", "c.png"))
+    import_cameras(job)
+    first, second, _ = by_role("camera")
+    assert not first.data.background_images
+    assert second.data.background_images
+    ours = part("camera_objects")
+    lost, unread = ours.problems(ours.read_import(job, (job,)))
+    assert "Not found" in lost
+    assert "c.png" in lost
+    assert "Blender does not read" in unread
+    assert "a.heic" in unread
+
+
 def test_photographs_that_were_turned_in_the_camera_are_turned_back(part: Any, job: Path) -> None:
     """EXIF says 90 degrees clockwise; Blender fits the picture before it turns it."""
     import_cameras(job)

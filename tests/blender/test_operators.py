@@ -405,13 +405,13 @@ def test_pictures_that_cannot_be_read_are_named(
     settings: Any, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
     add_pictures(tmp_path, "a.png", "b.png")
-    (tmp_path / "phone.HEIC").write_bytes(b"")
+    (tmp_path / "camera.NEF").write_bytes(b"")
     assert bpy.ops.fewview.add_images(directory=str(tmp_path)) == {"FINISHED"}
     assert names_in(settings) == ["a.png", "b.png"]
-    assert "phone.HEIC" in capfd.readouterr().out
+    assert "camera.NEF" in capfd.readouterr().out
     (tmp_path / "a.png").unlink()
     (tmp_path / "b.png").unlink()
-    with pytest.raises(RuntimeError, match=r"phone\.HEIC"):
+    with pytest.raises(RuntimeError, match=r"camera\.NEF"):
         bpy.ops.fewview.add_images(directory=str(tmp_path))
 
 

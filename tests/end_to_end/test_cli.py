@@ -281,11 +281,11 @@ def test_a_run_leaves_its_results_and_the_next_one_resumes(case: Case) -> None:
 
 
 def test_pictures_that_cannot_be_read_are_told(case: Case) -> None:
-    (case.photos / "phone.HEIC").write_bytes(b"")
+    (case.photos / "camera.NEF").write_bytes(b"")
     result = case.run()
-    assert "phone.HEIC" in result.stderr
+    assert "camera.NEF" in result.stderr
     warnings = json.loads((case.output / "report.json").read_text())["warnings"]
-    assert any("phone.HEIC" in text for text in warnings)
+    assert any("camera.NEF" in text for text in warnings)
 
 
 def test_a_job_that_keeps_no_stages_leaves_results_alone(case: Case) -> None:

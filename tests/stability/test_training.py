@@ -3,13 +3,14 @@
 import math
 import re
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import cache
 from itertools import count
 from types import ModuleType
 from typing import Any
 
+import jaxtyping
 import numpy as np
 import pytest
 import torch
@@ -20,7 +21,7 @@ from backend.errors import ErrorCode, ReconstructionError
 from backend.maths.grid import interpolate, locate
 from backend.point_methods import PointMethod
 from backend.scene import Decision, StereoResult, View, no_progress, transform_points
-from backend.stages import field_surface, neus_fit, radiance_fit
+from backend.stages import field_surface, neus_fit, point_network, radiance_fit
 from backend.stages.deadline import deadline_after
 from backend.stages.measurements import Measurements, carried, measurements
 from backend.stages.networks import HashConfig, NetworkConfig, NeuralSurface
@@ -107,7 +108,16 @@ def off_the_body(distance: Tensor) -> float:
     return float(values.abs().mean()) / CELL
 
 
+@pytest.fixture
+def shapes_are_known() -> Iterator[None]:
+    """They are the same for all seeds, and other tests check them: that takes a quarter of the time."""
+    jaxtyping.config.update("jaxtyping_disable", True)  # type: ignore[no-untyped-call]
+    yield
+    jaxtyping.config.update("jaxtyping_disable", False)  # type: ignore[no-untyped-call]
+
+
 @pytest.mark.slow
+@pytest.mark.usefixtures("shapes_are_known")
 @pytest.mark.parametrize(("seeds", "steps"), [(range(100), 20), (range(100, 105), 50)])
 def test_no_seed_leads_to_what_is_not_a_number(seeds: range, steps: int) -> None:
     """Whole runs, from soft to sharp, that differ in rays, queries and the network's start.
@@ -157,6 +167,7 @@ TINY_NETWORKS: dict[str, RadianceConfig | NeusConfig] = {
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("shapes_are_known")
 @pytest.mark.parametrize(
     ("preset", "seeds", "steps"),
     [
@@ -204,12 +215,16 @@ def few_points() -> PointCloud:
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("shapes_are_known")
 @pytest.mark.parametrize(
     ("method", "seeds"),
     [(PointMethod.LINEAR, range(5)), *((method, range(100)) for method in sorted(METHODS))],
 )
-def test_no_seed_of_points_alone_leads_to_what_is_not_a_number(method: PointMethod, seeds: range) -> None:
+def test_no_seed_of_points_alone_leads_to_what_is_not_a_number(
+    method: PointMethod, seeds: range, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """No step is taken back, and there is a surface around the middle, another for each seed."""
+    monkeypatch.setattr(point_network, "_QUERIES", 20_000)  # a step sees a hundred of them
     config = PointFitConfig(method=method, nodes=16, sides=TINY_POINT_NETWORK, network=TINY_POINT_NETWORK)
     middles = set()
     for seed in seeds:

@@ -88,6 +88,32 @@ def test_orientation_agrees_with_pillow(orientation: int, noise: np.ndarray, tmp
     assert (decoded.original_height, decoded.original_width) == expected.shape[:2]
 
 
+@pytest.mark.parametrize("orientation", [1, 3, 6, 8])
+def test_what_an_iphone_saves(orientation: int, tmp_path: Path) -> None:
+    """Turned by the file's own box, which EXIF repeats: once, not twice."""
+    rows, columns = np.mgrid[0:48, 0:64]
+    image = Image.fromarray(np.stack([4 * columns, 5 * rows, 128 + 0 * rows], axis=-1).astype(np.uint8))
+    exif = exif_with({ExifTags.Base.FocalLengthIn35mmFilm: 26})
+    exif[ExifTags.Base.Orientation] = orientation
+    image.save(tmp_path / "a.jpg", exif=exif, quality=95)
+    image.save(tmp_path / "a.HEIC", exif=exif.tobytes(), quality=95)
+    heic, jpeg = read_image(tmp_path / "a.HEIC"), read_image(tmp_path / "a.jpg")
+    assert (heic.original_width, heic.original_height) == (jpeg.original_width, jpeg.original_height)
+    np.testing.assert_allclose(heic.image_srgb, jpeg.image_srgb, atol=0.04)
+    assert heic.focal_px is not None
+    assert heic.focal_px == pytest.approx(jpeg.focal_px)
+    assert heic.mask is None
+
+
+def test_a_cutout_of_a_phone_has_its_mask(noise: np.ndarray, tmp_path: Path) -> None:
+    alpha = np.zeros(noise.shape[:2], np.uint8)
+    alpha[10:20, 10:40] = 255
+    Image.fromarray(np.dstack([noise, alpha])).save(tmp_path / "a.heic", quality=100)
+    mask = read_image(tmp_path / "a.heic").mask
+    assert mask is not None
+    np.testing.assert_array_equal(mask > 0.5, alpha > 0)
+
+
 @pytest.mark.parametrize("mode", ["L", "LA", "P", "RGB", "RGBA", "1"])
 @pytest.mark.parametrize("suffix", ["png", "tif"])
 def test_modes_give_the_colours_pillow_gives(
@@ -175,7 +201,7 @@ def test_senseless_exif_is_no_focal_length(value: object) -> None:
     assert focal_px_or_none(exif, 100, 100) is None
 
 
-@pytest.mark.parametrize("suffix", ["jpg", "png", "tif"])
+@pytest.mark.parametrize("suffix", ["jpg", "png", "tif", "heic"])
 @pytest.mark.parametrize("share", [0.0, 0.02, 0.6])
 def test_a_file_cut_short_is_refused_by_name(
     suffix: str, share: float, noise: np.ndarray, tmp_path: Path

@@ -263,6 +263,24 @@ def test_where_the_collapse_opens_the_mesh_more_faces_are_kept(monkeypatch: pyte
     assert 1500 < len(faces) <= 2000
 
 
+def test_a_foam_is_given_up_soon(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A field that has learned next to nothing crosses zero everywhere: no collapse leaves that closed."""
+    asked = []
+
+    def never(
+        vertices: np.ndarray, faces: np.ndarray, *, target_count: int, **_: object
+    ) -> tuple[np.ndarray, np.ndarray]:
+        asked.append(target_count)
+        return vertices, faces[1:]
+
+    monkeypatch.setattr(fast_simplification, "simplify", never)
+    whole = level_set(body_surface())
+    assert len(whole[1]) > 7705
+    _, faces = simplified(*whole, 500)
+    assert len(faces) == len(whole[1])
+    assert asked == [500, 600, 864, 1792, 7705]
+
+
 # normals
 
 

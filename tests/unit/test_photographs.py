@@ -37,14 +37,20 @@ def test_a_name_is_an_end_in_whole_words() -> None:
 
 
 def test_pictures_that_cannot_be_read_are_named(tmp_path: Path) -> None:
-    touched(tmp_path, "1.jpg", "2.HEIC", "3.heic", "4.dng", "5.gif", "notes.txt", ".6.heic", "sub/7.heic")
-    names = passed_over([tmp_path, tmp_path / "9.avif", tmp_path / "8.heic"])
-    assert names == ("2.HEIC", "3.heic", "4.dng", "5.gif")
-    assert "2.HEIC, 3.heic, 4.dng and 1 more" in passed_over_text(names)
+    touched(tmp_path, "1.jpg", "2.NEF", "3.jxl", "4.dng", "5.gif", "notes.txt", ".6.dng", "sub/7.dng")
+    names = passed_over([tmp_path, tmp_path / "9.avif", tmp_path / "8.dng"])
+    assert names == ("2.NEF", "3.jxl", "4.dng", "5.gif")
+    assert "2.NEF, 3.jxl, 4.dng and 1 more" in passed_over_text(names)
     assert passed_over_text(()) == ""
 
 
 def test_photographs_of_a_folder(tmp_path: Path) -> None:
-    touched(tmp_path, "1.jpg", "2.HEIC", "3.WEBP", "4.bmp", ".5.jpg", "sub/6.jpg")
+    touched(tmp_path, "1.jpg", "2.HEIC", "3.WEBP", "4.bmp", ".5.jpg", "sub/6.jpg", "8.dng")
     (tmp_path / "7.png").mkdir()
-    assert sorted(path.name for path in photographs_in(tmp_path)) == ["1.jpg", "3.WEBP", "4.bmp"]
+    assert sorted(path.name for path in photographs_in(tmp_path)) == ["1.jpg", "2.HEIC", "3.WEBP", "4.bmp"]
+
+
+def test_what_a_phone_saved_and_its_copy_are_one_photograph(tmp_path: Path) -> None:
+    touched(tmp_path, "IMG_1.HEIC", "IMG_1.JPG", "IMG_2.HEIC", "IMG_3.jpg", "IMG_4.heif", "IMG_4.png")
+    found = sorted(path.name for path in photographs_in(tmp_path))
+    assert found == ["IMG_1.JPG", "IMG_2.HEIC", "IMG_3.jpg", "IMG_4.png"]
