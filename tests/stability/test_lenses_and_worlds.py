@@ -163,13 +163,13 @@ def test_of_many_photographs_a_few_tell_the_lens(
     mapped, tried = structure_from_motion._mapped, []
 
     def counting(*given: Any) -> list[pycolmap.Reconstruction]:
-        tried.append(len(given[6]) if len(given) > 6 else 0)
+        tried.append(len(given[5]) if len(given) > 5 else 0)
         return mapped(*given)
 
     monkeypatch.setattr(structure_from_motion, "_mapped", counting)
     solve = partial(solve_cameras, photos, None, CamerasConfig(), seed=0, progress=no_progress)
     assert worst_turn_deg(solve(workdir=tmp_path / "ours"), poses) < 1.0
-    assert tried == [0, *4 * [structure_from_motion._FEW_PHOTOS]], "the usual lens and three others"
+    assert sorted(tried) == [0, *4 * [structure_from_motion._FEW_PHOTOS]], "the usual lens and three others"
 
 
 @pytest.mark.slow

@@ -196,23 +196,26 @@ def lens_kept(
     PIL.Image.new("L", (64, 48)).save(tmp_path / "0000.png")
     group = structure_from_motion.LensGroup(names=("0000.png",), width=64, height=48, focal_px=None)
     structure_from_motion.register_pictures(tmp_path / "a.db", tmp_path, [group])
-    begun, made = [1.2], []
+    begun: dict[Path, float] = {}
+    made: list[tuple[float, int]] = []
     confirmed: dict[pycolmap.Reconstruction, int] = {}
 
     def model_with(number: int) -> pycolmap.Reconstruction:
         confirmed[model := pycolmap.Reconstruction()] = number
         return model
 
-    def mapped(names: Sequence[str] = ()) -> list[pycolmap.Reconstruction]:
-        made.append((begun[-1], len(names) or 20))
-        return [model_with((few if names else whole)[begun[-1]])]
+    def mapped(database: Path, names: Sequence[str] = ()) -> list[pycolmap.Reconstruction]:
+        factor = begun.get(database, 1.2)
+        made.append((factor, len(names) or 20))
+        return [model_with((few if names else whole)[factor])]
 
-    monkeypatch.setattr(structure_from_motion, "_begin_with", lambda _, __, factor: begun.append(factor))
+    monkeypatch.setattr(structure_from_motion, "_begin_with", begun.__setitem__)
+    monkeypatch.setattr(structure_from_motion, "_num_threads", lambda: 1)
     monkeypatch.setattr(structure_from_motion, "_few_that_share_most", lambda _: ["0", "1"])
     monkeypatch.setattr(structure_from_motion, "_merit", lambda model: (20, confirmed[model], 0))
     kept = structure_from_motion._with_another_lens(model_with(whole[1.2]), tmp_path / "a.db", mapped)
     assert kept is not None
-    assert begun[-1] == 1.2, "later attempts begin as usual"
+    assert tmp_path / "a.db" not in begun, "later attempts begin as usual"
     return confirmed[kept], made
 
 
@@ -290,6 +293,16 @@ def test_of_large_photographs_features_are_sought_finely_where_there_are_few(
     assert min(fine) > 1.5 * max(coarse)
     monkeypatch.setattr(structure_from_motion, "_PLENTY", plenty)
     assert found(tmp_path / "asked.db", 0, 10**9) == (fine if is_fine else coarse)
+
+
+@pytest.mark.parametrize(("num_photos", "side_px"), [(3, 1280), (4, 1600)])
+def test_a_few_large_photographs_are_looked_at_smaller(num_photos: int, side_px: int) -> None:
+    """Their features are sought at twice the resolution, of more of them not."""
+    large = replace(
+        make_photo("a.png", np.zeros((4, 6, 3), np.float32)), original_width=3072, original_height=2048
+    )
+    assert structure_from_motion._picture_side_px(num_photos * [large], 1600) == side_px
+    assert structure_from_motion._picture_side_px(num_photos * [large], 800) == 800
 
 
 def test_progress_can_cancel(corner: list[Photo], tmp_path: Path) -> None:
