@@ -9,7 +9,7 @@ from ..scene import Decision, Progress
 from .deadline import Deadline
 from .linear_fit import Ask, LinearConfig, for_plain, for_textured, weight_beside
 from .measurements import Measurements
-from .shared_brightness import MOSTLY_TEXTURED, ShownPlaces, decision, share_told, shared_brightness, textured
+from .shared_brightness import MOSTLY_TEXTURED, ShownPlaces, share_told, shared_brightness, textured
 
 _LITTLE = 0.1
 """Weight of what brightness tells, beside stereo's points: with less, asking again moves nothing."""
@@ -36,20 +36,36 @@ class Looks:
 
     @property
     def _mostly_textured(self) -> bool:
-        return self.shares[-1] > MOSTLY_TEXTURED
+        return bool(self.shares) and self.shares[-1] > MOSTLY_TEXTURED
 
     @property
     def decisions(self) -> tuple[Decision, ...]:
         """What was made of texture, and what brightness was worth."""
         if not self.shares:
-            return (decision(self.shares, self.shown),)
+            return (self.of_brightness,)
         linear = for_textured(self.linear) if self._mostly_textured else self.linear
         doubt = Decision(
             what="doubtful points",
             choice=f"weigh as their confidence to the power of {linear.confidence_power:g}",
             because=f"patches tell {self.shares[-1]:.0%} of the surface",
         )
-        return (doubt, decision(self.shares, self.shown))
+        return (doubt, self.of_brightness)
+
+    @property
+    def of_brightness(self) -> Decision:
+        """What it was worth."""
+        what, count = "brightness without texture", max((len(s.weights) for s in self.shown), default=0)
+        if count:
+            because = f"the same from two sides, it tells the depth of {count} places that no texture tells"
+            if (most := max(float(s.mirrored.max()) for s in self.shown if len(s.mirrored))) > 0:
+                because += f"; it shines, and what it mirrors, up to {most:.1%} of white, is taken off"
+        elif self.shown:
+            because = "what patches agree on is not equally bright, or too little to tell"
+        elif self._mostly_textured:
+            because = f"patches tell {self.shares[-1]:.0%} of the surface"
+        else:
+            because = "not asked for, or time ran out before it"
+        return Decision(what=what, choice="used" if count else "left out", because=because)
 
     def planned(
         self, before: Float[Tensor, "nodes nodes nodes"], wanted: int, *, is_last: bool

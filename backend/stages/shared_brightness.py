@@ -12,7 +12,6 @@ shines, the part that mirrored directions explain is taken off before (shine).
 """
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -37,7 +36,6 @@ from ..maths.grid import spacing
 from ..maths.mirrored_light import means_of_bins, mirrored_bins
 from ..maths.rows import Rows, together
 from ..maths.srgb import linear_from_srgb
-from ..scene import Decision
 from .measurements import SURE, Measurements
 from .seen_field import NearSurface, at_size, may_show, seen_field, smaller
 from .shine import Boxes, Shine, deviations, mirrored_by
@@ -148,22 +146,6 @@ def share_told(told: ShownPlaces, distance: Float[Tensor, "nodes nodes nodes"]) 
     # a plane goes through |n_x| + |n_y| + |n_z| cells for each square of a cell's side: on average 1.5
     met = int((distance.abs() < 0.75 * h).sum())
     return len(torch.unique(cube_keys(told.positions, h))) / max(met, 1)
-
-
-def decision(shares: Sequence[float], shown: Sequence[ShownPlaces]) -> Decision:
-    """What it was worth in a fit's passes, for the report; `shares` are `textured` on its grids."""
-    what, count = "brightness without texture", max((len(s.weights) for s in shown), default=0)
-    if count:
-        because = f"the same from two sides, it tells the depth of {count} places that no texture tells"
-        if (most := max(float(s.mirrored.max()) for s in shown if len(s.mirrored))) > 0:
-            because += f"; it shines, and what it mirrors, up to {most:.1%} of white, is taken off"
-    elif shown:
-        because = "what patches agree on is not equally bright, or too little to tell"
-    elif shares and shares[-1] > MOSTLY_TEXTURED:
-        because = f"patches tell {shares[-1]:.0%} of the surface"
-    else:
-        because = "not asked for, or time ran out before it"
-    return Decision(what=what, choice="used" if count else "left out", because=because)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -378,13 +378,13 @@ def _with_another_lens(
     best_of_few = max(mapped(database, few), key=_merit, default=None) if few else None
 
     def begun_with(factor: float) -> list[pycolmap.Reconstruction]:
-        other = database.parent / f"begun_with_{factor:g}" / database.name
-        other.parent.mkdir(exist_ok=True)
-        shutil.copyfile(database, other)
-        _begin_with(other, factor)
-        if few and not any(_is_clearly_better(of_few, best_of_few) for of_few in mapped(other, few)):
+        own = database.parent / f"begun_with_{factor:g}" / database.name
+        own.parent.mkdir(exist_ok=True)
+        shutil.copyfile(database, own)
+        _begin_with(own, factor)
+        if few and not any(_is_clearly_better(of_few, best_of_few) for of_few in mapped(own, few)):
             return []
-        return mapped(other)
+        return mapped(own)
 
     best = model
     with ThreadPoolExecutor(_num_threads()) as threads:

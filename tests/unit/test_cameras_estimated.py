@@ -2,6 +2,7 @@
 
 import json
 import math
+import threading
 from collections.abc import Sequence
 from dataclasses import replace
 from itertools import combinations
@@ -316,6 +317,19 @@ def test_progress_can_cancel(corner: list[Photo], tmp_path: Path) -> None:
     with pytest.raises(Cancelled):
         solve_cameras(corner, None, CONFIG, workdir=tmp_path, seed=0, progress=cancel)
     assert shares == sorted(shares)
+
+
+def test_a_run_is_cancelled_while_it_tries_other_lenses(corner: list[Photo], tmp_path: Path) -> None:
+    threads = set()
+
+    def cancel(_share: float, text: str) -> None:
+        if text == "Placing cameras":
+            threads.add(threading.current_thread())
+            if len(threads) > 1:
+                raise Cancelled
+
+    with pytest.raises(Cancelled):
+        solve_cameras(corner, None, CONFIG, workdir=tmp_path, seed=0, progress=cancel)
 
 
 def test_joined_beliefs() -> None:

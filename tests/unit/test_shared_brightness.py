@@ -1,6 +1,7 @@
 """A matt ball under an even light, whose field is too large where nothing was measured: brightness tells."""
 
 import math
+import time
 from dataclasses import replace
 
 import pytest
@@ -13,10 +14,13 @@ from backend.maths.geometry import Pinhole, pixel_centres, project, ray_directio
 from backend.maths.grid import locate, node_positions, read, spacing, value_and_gradient
 from backend.maths.mirrored_light import BINS
 from backend.maths.srgb import srgb_from_linear
+from backend.scene import Decision
 from backend.stages import shared_brightness as stage
+from backend.stages.deadline import deadline_after
 from backend.stages.linear_fit import LinearConfig, ask_nothing, fit_level, for_plain
+from backend.stages.looks import Looks
 from backend.stages.measurements import SURE, Measurements
-from backend.stages.shared_brightness import ShownPlaces, decision, share_told, shared_brightness, textured
+from backend.stages.shared_brightness import ShownPlaces, share_told, shared_brightness, textured
 from backend.stages.shine import Boxes, deviations, mirrored_by
 
 NODES, SIZE, RADIUS = 64, 320, 0.6
@@ -472,18 +476,24 @@ def test_who_has_nothing_to_tell_is_not_asked_again() -> None:
 def test_the_report_says_what_it_was_worth() -> None:
     shown = shared_brightness(scene(), too_large())
     nothing = shared_brightness(scene(known_up_to=-1.0), too_large())
-    used = decision([0.5], [shown, nothing])
+
+    def told(shares: list[float], shown: list[ShownPlaces]) -> Decision:
+        linear, deadline = LinearConfig(), deadline_after(None, time.perf_counter)
+        looks = Looks(scene=scene(), linear=linear, deadline=deadline, shares=shares, shown=shown)
+        return looks.of_brightness
+
+    used = told([0.5], [shown, nothing])
     assert used.choice == "used"
     assert str(len(shown.weights)) in used.because
     assert "shines" not in used.because
     shining = replace(shown, mirrored=torch.full_like(shown.mirrored, 0.021))
-    assert "2.1%" in decision([0.5], [nothing, shining]).because
-    for shares, told, why in (
+    assert "2.1%" in told([0.5], [nothing, shining]).because
+    for shares, looks, why in (
         ([0.5], [nothing], "too little"),
         ([0.5, 0.93], [], "93%"),
         ([0.5], [], "time"),
         ([], [], "time"),
     ):
-        left_out = decision(shares, told)
+        left_out = told(shares, looks)
         assert left_out.choice == "left out"
         assert why in left_out.because
