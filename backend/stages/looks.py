@@ -53,7 +53,7 @@ class Looks:
 
     @property
     def of_brightness(self) -> Decision:
-        """What it was worth."""
+        """What brightness was worth, for the report."""
         what, count = "brightness without texture", max((len(s.weights) for s in self.shown), default=0)
         if count:
             because = f"the same from two sides, it tells the depth of {count} places that no texture tells"

@@ -319,7 +319,10 @@ def test_progress_can_cancel(corner: list[Photo], tmp_path: Path) -> None:
     assert shares == sorted(shares)
 
 
-def test_a_run_is_cancelled_while_it_tries_other_lenses(corner: list[Photo], tmp_path: Path) -> None:
+def test_a_run_is_cancelled_while_it_tries_other_lenses(
+    corner: list[Photo], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(structure_from_motion, "_num_threads", lambda: 2)
     threads = set()
 
     def cancel(_share: float, text: str) -> None:
