@@ -20,6 +20,9 @@ from .stereo_config import StereoConfig
 _TEXTURED = 6.0
 """Contrast of a patch, in deviations of noise, with which it is like no other; of all depths of one that has
 less, some agrees by chance."""
+_SAME_PLACE_DEG, _NARROW_DEG, _WIDE_DEG, _WIDEST_DEG = 0.5, 5.0, 45.0, 75.0
+"""Between two views: that tell nothing of depth; that tell little; whose patches are slanted so much for each
+other that they add nothing to what two nearer views tell; that are not compared at all."""
 _DETOUR = 1.25
 """A view is between two others if the way past it is at most so many times as long."""
 
@@ -122,18 +125,18 @@ def _bounding_box(subject: Bool[Tensor, "height width"]) -> tuple[int, int, int,
 def neighbours(cameras: list[Pinhole], count: int) -> list[list[int]]:
     """For each view the others to compare with: similar direction, but not the same place.
 
-    The wish is 5 to 25 degrees seen from the middle of the region; wider pairs are taken where there
-    is nothing nearer, up to 75 degrees.
+    The wish is 5 to 25 degrees seen from the middle of the region. Pairs of more than 45 degrees, up to 75,
+    are taken only until there are two: their patches agree less, and by chance as well.
     """
     angles_deg = _angles_deg(cameras)
-    chosen = []
-    for i in range(len(cameras)):
-        costs = sorted(
-            (_pair_cost(float(angles_deg[i, j])), j)
-            for j in range(len(cameras))
-            if j != i and 0.5 < float(angles_deg[i, j]) < 75
-        )
-        chosen.append([j for _, j in costs[:count]])
+    chosen: list[list[int]] = []
+    for apart_deg in angles_deg:
+        near: list[int] = []
+        for j in sorted(range(len(cameras)), key=lambda j: _pair_cost(apart_deg[j])):
+            few = sum(apart_deg[k] > _NARROW_DEG for k in near) < 2
+            if _SAME_PLACE_DEG < apart_deg[j] < (_WIDEST_DEG if few else _WIDE_DEG):
+                near.append(j)
+        chosen.append(near[:count])
     return chosen
 
 
@@ -157,4 +160,4 @@ def _angles_deg(cameras: list[Pinhole]) -> Float64[np.ndarray, "views views"]:
 
 def _pair_cost(angle_deg: float) -> float:
     """Lowest at 12 degrees; twice as bad at half or double that."""
-    return abs(math.log(angle_deg / 12.0))
+    return abs(math.log(angle_deg / 12.0)) if angle_deg > 0 else math.inf

@@ -1,5 +1,6 @@
 """Depth maps and points against the truth they were drawn from; no points where nothing can be measured."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
 
@@ -9,20 +10,21 @@ import torch
 from scipy.ndimage import distance_transform_edt, gaussian_filter
 
 from backend.errors import Cancelled, ErrorCode, ReconstructionError
-from backend.maths.geometry import pinhole_in_object
+from backend.maths.geometry import Pinhole, pinhole_in_object
 from backend.maths.raycast import camera_rays
 from backend.scene import Camera, Region, StereoResult, View, no_progress, transform_points
 from backend.stages.depth_maps import depth_maps
 from backend.stages.outlines_alone import hollows_filled
 from backend.stages.stereo import match_views
 from backend.stages.stereo_config import StereoConfig
-from backend.stages.stereo_windows import pyramid, views_between
+from backend.stages.stereo_windows import neighbours, pyramid, views_between
 from tests.synthetic_scene import (
     CENTRE,
     OBJECT_UNIT,
     SIZE,
     Scene,
     arc_cameras,
+    camera_at,
     diagonal,
     photographed,
     surface_distance,
@@ -380,10 +382,40 @@ def test_from_within_the_region_a_step_may_lead_beyond_all_that_moves() -> None:
     assert [float(sizes[0].map.behind.max()) for sizes in maps] == [0, 0]
 
 
+def pinholes(cameras: Sequence[Camera]) -> list[Pinhole]:
+    return [pinhole_in_object(camera, true_region(), torch.device("cpu")) for camera in cameras]
+
+
+def at_azimuths(*azimuths_deg: float) -> list[Pinhole]:
+    """Level with the body, so that azimuths are as far apart as views are."""
+    return pinholes([camera_at(azimuth, 0.0, 160) for azimuth in azimuths_deg])
+
+
+def test_views_are_compared_with_those_beside_them() -> None:
+    assert neighbours(at_azimuths(0, 20, 40), 3) == [[1, 2], [0, 2], [1, 0]]
+    assert neighbours(at_azimuths(0, 12, 26, 38), 2) == [[1, 2], [0, 2], [3, 1], [2, 1]]
+
+
+def test_what_is_seen_at_a_slant_is_compared_only_where_there_are_no_two_nearer_views() -> None:
+    arc = at_azimuths(0, 24, 48, 72, 96)
+    assert [sorted(near) for near in neighbours(arc, 3)] == [[1, 2], [0, 2], [1, 3], [2, 4], [2, 3]]
+
+
+@pytest.mark.parametrize("num_views", [5, 6, 7, 8])
+def test_a_ring_of_few_views_is_compared_all_the_way_round(num_views: int) -> None:
+    ring = at_azimuths(*(360 * index / num_views for index in range(num_views)))
+    for index, near in enumerate(neighbours(ring, 3)):
+        assert sorted(near) == sorted({(index - 1) % num_views, (index + 1) % num_views})
+
+
+def test_views_from_about_one_place_are_compared_with_wide_ones_too() -> None:
+    """From 4 degrees apart alone, depth would be told badly; from the same place, not at all."""
+    assert neighbours(at_azimuths(0, 4, -4, 55), 3)[0] == [1, 2, 3]
+    assert neighbours(at_azimuths(0, 0.1, 55, 140), 3) == [[2], [2], [1, 0], []]
+
+
 def test_views_between_are_about_on_the_way() -> None:
-    cameras = [
-        pinhole_in_object(camera, true_region(), torch.device("cpu")) for camera in arc_cameras(5, 60, 160)
-    ]
+    cameras = pinholes(arc_cameras(5, 60, 160))
     assert views_between(cameras, 0, 2) == [1]
     assert views_between(cameras, 4, 0) == [1, 2, 3]
     assert views_between(cameras, 1, 2) == []
