@@ -1,7 +1,7 @@
-"""Sphere tracing through a function on a grid, ray by ray, compiled for the CPU.
+"""Looking along rays through a function on a grid, ray by ray, compiled for the CPU.
 
-The same as `backend.maths.rays.first_crossing` of `backend.maths.grid.read`, which is the reference and what
-a GPU runs.
+The same as `first_crossing` and `lowest_along` of `backend.maths.rays` with `backend.maths.grid.read`, which
+are the reference and what a GPU runs.
 """
 
 import numpy as np
@@ -77,6 +77,32 @@ def first_crossings(
             before, last = here, at
             at = min(at + min(max(CAUTION * here, shortest), longest), end)
         along[ray], hit[ray] = place, met
+
+
+@compiled
+def lowest(
+    rows: tuple[int, int],
+    grid: Floats,
+    origins: Floats,
+    directions: Floats,
+    middle: Floats,
+    steps: Floats,
+    along: Floats,
+    least: Floats,
+) -> None:
+    """Of some of the rays, `along` and `least` written."""
+    for ray in range(rows[0], rows[1]):
+        a, b, c = origins[ray, 0], origins[ray, 1], origins[ray, 2]
+        d, e, f = directions[ray, 0], directions[ray, 1], directions[ray, 2]
+        place, nearest = ZERO, np.float32(np.inf)
+        for step in steps:
+            at = max(middle[ray] + step, ZERO)
+            x, y, z = a + at * d, b + at * e, c + at * f
+            if abs(x) < ONE and abs(y) < ONE and abs(z) < ONE:
+                here = read(grid, x, y, z)
+                if here < nearest:
+                    nearest, place = here, at
+        along[ray], least[ray] = place, nearest
 
 
 def error_of_a_plane_ahead() -> float:

@@ -15,8 +15,8 @@ from ..kernels.side_by_side import side_by_side
 from .grid import read
 from .repeated import State, repeated
 
-_RAYS_IN_ONE_GO = 4096
-"""Of a thread, where compiled."""
+_TRACED_IN_ONE_GO, _SEARCHED_IN_ONE_GO = 4096, 512
+"""Rays of a thread, where compiled."""
 DistanceFunction = Callable[[Float[Tensor, "points 3"]], Float[Tensor, "points"]]
 
 
@@ -90,6 +90,46 @@ def first_crossing(
     return Crossing(along=at, hit=met)
 
 
+def lowest_along(
+    grid: Float[Tensor, "nodes nodes nodes"],
+    origins: Float[Tensor, "rays 3"],
+    directions: Float[Tensor, "rays 3"],
+    middle: Float[Tensor, "rays"],
+    steps: Float[Tensor, "steps"],
+) -> tuple[Float[Tensor, "rays"], Float[Tensor, "rays"]]:
+    """Where along each ray, `middle + steps` from its origin, the grid's function is lowest; and how low.
+
+    Inside the cube alone: infinite for rays that miss it. Nothing behind an origin is looked at. Compiled on
+    the CPU in single precision, as `first_crossing` is.
+    """
+    if grid.device.type == "cpu" and grid.dtype == torch.float32:
+        along, least = np.empty(len(middle), np.float32), np.empty(len(middle), np.float32)
+        given = (floats(grid), floats(origins), floats(directions), floats(middle), floats(steps))
+
+        def look(rows: tuple[int, int]) -> None:
+            ray_crossing.lowest(rows, *given, along, least)
+
+        side_by_side(look, _rows(len(middle), _SEARCHED_IN_ONE_GO), torch.get_num_threads())
+        return torch.from_numpy(along), torch.from_numpy(least)
+    return lowest_in_torch(grid, origins, directions, middle, steps)
+
+
+def lowest_in_torch(
+    grid: Float[Tensor, "nodes nodes nodes"],
+    origins: Float[Tensor, "rays 3"],
+    directions: Float[Tensor, "rays 3"],
+    middle: Float[Tensor, "rays"],
+    steps: Float[Tensor, "steps"],
+) -> tuple[Float[Tensor, "rays"], Float[Tensor, "rays"]]:
+    """`lowest_along` on any device; the reference for what is compiled."""
+    along = (middle[:, None] + steps).clamp(min=0)
+    points = points_along(origins, directions, along)
+    values = read(grid, points.reshape(-1, 3)).reshape(along.shape)
+    values = torch.where(points.abs().amax(dim=-1) < 1, values, torch.inf)
+    least, index = values.min(dim=1)
+    return torch.where(least.isinf(), 0.0, along.gather(1, index[:, None])[:, 0]), least
+
+
 def _compiled_crossing(
     grid: Float[Tensor, "nodes nodes nodes"],
     origins: Float[Tensor, "rays 3"],
@@ -100,12 +140,16 @@ def _compiled_crossing(
     along, hit = np.empty(len(start), np.float32), np.empty(len(start), np.bool_)
     field, rays = floats(grid), (floats(origins), floats(directions), floats(start))
 
-    def trace(first: int) -> None:
-        rows = (first, min(first + _RAYS_IN_ONE_GO, len(along)))
+    def trace(rows: tuple[int, int]) -> None:
         ray_crossing.first_crossings(rows, field, *rays, limits, along, hit)
 
-    side_by_side(trace, range(0, len(along), _RAYS_IN_ONE_GO), torch.get_num_threads())
+    side_by_side(trace, _rows(len(along), _TRACED_IN_ONE_GO), torch.get_num_threads())
     return Crossing(along=torch.from_numpy(along), hit=torch.from_numpy(hit))
+
+
+def _rows(count: int, at_once: int) -> list[tuple[int, int]]:
+    """(first, one past the last) of each part."""
+    return [(first, min(first + at_once, count)) for first in range(0, count, at_once)]
 
 
 def _traced(

@@ -16,8 +16,8 @@ from torch import Tensor
 from ..maths.correlation import window_sum
 from ..maths.evidence import half_cell_px
 from ..maths.geometry import ray_directions
-from ..maths.grid import read, spacing
-from ..maths.rays import points_along
+from ..maths.grid import spacing
+from ..maths.rays import lowest_along
 from .measurements import Measurements
 
 _FARTHEST_CELLS = 6.0
@@ -60,13 +60,9 @@ def rim_points(
     reach = math.sqrt(3.0)
     count = math.ceil(2 * reach / h) + 1
     steps = torch.linspace(-reach, reach, count, device=distance.device)
-    along = (rays.origins.norm(dim=-1, keepdim=True) + steps).clamp(min=0)
-    points = points_along(rays.origins, rays.directions, along)
-    values = read(distance, points.reshape(-1, 3)).reshape(along.shape)
-    values = torch.where(points.abs().amax(dim=-1) < 1, values, math.inf)
-    lowest, index = values.min(dim=1)
+    along, lowest = lowest_along(distance, rays.origins, rays.directions, rays.origins.norm(dim=-1), steps)
     near = lowest.abs() < _FARTHEST_CELLS * h
-    return points[near, index[near]], rays.normals[near]
+    return (rays.origins + along[:, None] * rays.directions)[near], rays.normals[near]
 
 
 def _outline(

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from backend.maths.grid import node_positions, read
-from backend.maths.rays import first_crossing, sphere_entry
+from backend.maths.rays import first_crossing, lowest_along, lowest_in_torch, sphere_entry
 
 RADIUS = 0.5
 
@@ -175,3 +175,24 @@ def test_compiled_tracing_stays_in_the_grid_whatever_it_is_given(number: float) 
     assert (without.along == 1).all()
     assert not without.hit.any()
     assert first_crossing(field, origins[:0], directions[:0], torch.zeros(0)).hit.shape == (0,)
+
+
+def test_a_ray_is_lowest_where_it_passes_the_middle_of_a_ball() -> None:
+    """At the nearest of its places; nowhere if it misses the cube; never behind the eye."""
+    nodes = 65
+    field = node_positions(nodes, torch.device("cpu")).norm(dim=-1) - 0.5
+    origins = torch.tensor([[-3.0, 0.2, 0.1], [-3.0, 1.1, 0.0], [0.5, 0.0, 0.0]])
+    directions = torch.tensor([[1.0, 0, 0], [1, 0, 0], [1, 0, 0]])
+    along, least = lowest_along(field, origins, directions, origins.norm(dim=-1), torch.linspace(-2, 2, 401))
+    torch.testing.assert_close(along, torch.tensor([3.0, 0.0, 0.0]), atol=0.02, rtol=0)
+    expected = torch.tensor([math.sqrt(0.05) - 0.5, math.inf, 0.0])
+    torch.testing.assert_close(least, expected, atol=2e-3, rtol=0)
+
+
+def test_what_is_compiled_finds_the_lowest_place_of_the_reference() -> None:
+    origins, directions = rays_towards(2000, 1.3)
+    given = (wavy_field(17), origins, directions, origins.norm(dim=-1), torch.linspace(-1.7, 1.7, 60))
+    (along, least), (there, value) = lowest_along(*given), lowest_in_torch(*given)
+    assert 10 < int(value.isinf().sum()) < 1000
+    torch.testing.assert_close(least, value, atol=1e-5, rtol=0)
+    assert float((along == there).float().mean()) > 0.99
