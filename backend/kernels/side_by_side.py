@@ -19,10 +19,11 @@ def side_by_side(work: Callable[[Task], Result], tasks: Iterable[Task], threads:
     return list(_pool(threads).map(work, tasks))
 
 
-def bands_side_by_side(work: Callable[[tuple[int, int]], None], height: int, threads: int) -> None:
-    """Of rows, given as (first, one past the last), together all of the height."""
-    tops = range(0, height, BAND)
-    side_by_side(work, [(top, min(top + BAND, height)) for top in tops], threads)
+def bands_side_by_side(
+    work: Callable[[tuple[int, int]], None], rows: int, threads: int, *, band: int = BAND
+) -> None:
+    """Of rows, given as (first, one past the last), together all of them."""
+    side_by_side(work, [(top, min(top + band, rows)) for top in range(0, rows, band)], threads)
 
 
 @cache

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from ..kernels import ray_crossing
 from ..kernels.compiled import floats
-from ..kernels.side_by_side import side_by_side
+from ..kernels.side_by_side import bands_side_by_side
 from .grid import read
 from .repeated import State, repeated
 
@@ -109,7 +109,7 @@ def lowest_along(
         def look(rows: tuple[int, int]) -> None:
             ray_crossing.lowest(rows, *given, along, least)
 
-        side_by_side(look, _rows(len(middle), _SEARCHED_IN_ONE_GO), torch.get_num_threads())
+        bands_side_by_side(look, len(middle), torch.get_num_threads(), band=_SEARCHED_IN_ONE_GO)
         return torch.from_numpy(along), torch.from_numpy(least)
     return lowest_in_torch(grid, origins, directions, middle, steps)
 
@@ -143,13 +143,8 @@ def _compiled_crossing(
     def trace(rows: tuple[int, int]) -> None:
         ray_crossing.first_crossings(rows, field, *rays, limits, along, hit)
 
-    side_by_side(trace, _rows(len(along), _TRACED_IN_ONE_GO), torch.get_num_threads())
+    bands_side_by_side(trace, len(along), torch.get_num_threads(), band=_TRACED_IN_ONE_GO)
     return Crossing(along=torch.from_numpy(along), hit=torch.from_numpy(hit))
-
-
-def _rows(count: int, at_once: int) -> list[tuple[int, int]]:
-    """(first, one past the last) of each part."""
-    return [(first, min(first + at_once, count)) for first in range(0, count, at_once)]
 
 
 def _traced(

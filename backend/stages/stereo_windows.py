@@ -132,9 +132,9 @@ def neighbours(cameras: list[Pinhole], count: int) -> list[list[int]]:
     chosen: list[list[int]] = []
     for apart_deg in angles_deg:
         near: list[int] = []
-        for j in sorted(range(len(cameras)), key=lambda j: _pair_cost(apart_deg[j])):
-            few = sum(apart_deg[k] > _NARROW_DEG for k in near) < 2
-            if _SAME_PLACE_DEG < apart_deg[j] < (_WIDEST_DEG if few else _WIDE_DEG):
+        others = np.flatnonzero((apart_deg > _SAME_PLACE_DEG) & (apart_deg < _WIDEST_DEG)).tolist()
+        for j in sorted(others, key=lambda j: _pair_cost(apart_deg[j])):
+            if apart_deg[j] < _WIDE_DEG or sum(apart_deg[k] > _NARROW_DEG for k in near) < 2:
                 near.append(j)
         chosen.append(near[:count])
     return chosen
@@ -160,4 +160,4 @@ def _angles_deg(cameras: list[Pinhole]) -> Float64[np.ndarray, "views views"]:
 
 def _pair_cost(angle_deg: float) -> float:
     """Lowest at 12 degrees; twice as bad at half or double that."""
-    return abs(math.log(angle_deg / 12.0)) if angle_deg > 0 else math.inf
+    return abs(math.log(angle_deg / 12.0))
