@@ -112,6 +112,20 @@ def median_deviation(off: Float[Tensor, "*channels values"]) -> Float[Tensor, "*
     return _SIGMA_OF_MEDIAN_DEVIATION * off.abs().median(dim=-1).values
 
 
+def grain(
+    difference: Float[Tensor, "channels height width"],
+    where: Bool[Tensor, "height width"],
+    radius_px: int,
+) -> Float[Tensor, "channels"]:
+    """Standard deviation of what goes from pixel to pixel: off the windows' means, `where` it is known.
+
+    What is off in a few places, as along an edge, has no part in it. There must be one that is known.
+    """
+    count = window_sum(where[None].to(difference.dtype), radius_px).clamp(min=1)
+    means = window_sum(torch.where(where, difference, 0.0), radius_px) / count
+    return median_deviation((difference - means)[:, where])
+
+
 def means_of_cells(
     values: Float[Tensor, "channels places"], cell: Int64[Tensor, "places"], fewest: int
 ) -> Float[Tensor, "channels cells"]:

@@ -26,6 +26,7 @@ from ..maths.brightness import (
     channels_of,
     depth_steps,
     exposure_ratio,
+    grain,
     means_of_cells,
     slopes_along,
 )
@@ -304,9 +305,12 @@ def _compared(one: _Picture, other: _Picture, nodes: int) -> _Compared | None:
 
 def _told(pair: _Compared, matt_noise: Float[Tensor, "channels"], shine: Shine | None) -> ShownPlaces:
     """The places that are told well enough, by how much each channel depends on the view."""
+    if len(pair.places.pixel) == 0:
+        return _nothing(pair.difference.device)
     matt, noise = pair.difference, matt_noise[:, None, None]
     if shine is not None:
         matt, noise = shine.taken_off(pair.difference, pair.bins)
+    noise = (noise.square() + _grain_of_colours(pair).square()[:, None, None]).sqrt()
     straight, difference, slope = pair.slopes.straight, matt / noise, pair.slopes.slope / noise
     steps = depth_steps(difference, slope, straight, _WINDOW_PX)
     around = depth_steps(difference, slope, straight, _WIDE_PX)
@@ -324,6 +328,18 @@ def _told(pair: _Compared, matt_noise: Float[Tensor, "channels"], shine: Shine |
         directions=places.directions,
         hidden=(step > _SURELY * deviation) & (step > _BRIDGED_CELLS * pair.cell),
     )
+
+
+def _grain_of_colours(pair: _Compared) -> Float[Tensor, "channels"]:
+    """Noise of single pixels, which boxes average away; 0 of brightness.
+
+    What is grey has no slope of its own in its colours, but in units of what boxes leave their grain has one,
+    agrees with any depth, and cuts steps short. Brightness has a slope beside its grain.
+    """
+    where = torch.zeros_like(pair.difference[0], dtype=torch.bool)
+    where.view(-1)[pair.places.pixel] = True
+    off = grain(pair.difference, where, _WIDE_PX)
+    return torch.cat([torch.zeros_like(off[:1]), off[1:]])
 
 
 def _off_outlines(scene: Measurements, shown: ShownPlaces) -> ShownPlaces:

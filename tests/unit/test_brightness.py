@@ -1,5 +1,7 @@
 """The first-order step to where two photographs show the same: closed forms and laws."""
 
+import math
+
 import pytest
 import torch
 
@@ -7,6 +9,7 @@ from backend.maths.brightness import (
     channels_of,
     depth_steps,
     exposure_ratio,
+    grain,
     means_of_cells,
     median_deviation,
     slopes_along,
@@ -126,3 +129,16 @@ def test_a_median_deviation_is_that_of_a_normal_law_whatever_the_worst_are() -> 
     torch.testing.assert_close(median_deviation(off), torch.tensor([0.1, 3.0]), rtol=0.03, atol=0)
     worse = torch.where(off.abs() > off.abs().median(dim=-1, keepdim=True).values, 1e6 * off, off)
     torch.testing.assert_close(median_deviation(worse), median_deviation(off), rtol=0, atol=0)
+
+
+def test_grain_is_what_goes_from_pixel_to_pixel() -> None:
+    """Neither what changes slowly, nor an edge, nor what is not known."""
+    size, radius = 60, 4
+    noise = torch.randn((2, size, size), generator=torch.Generator().manual_seed(0))
+    difference = noise * torch.tensor([0.1, 2.0])[:, None, None] + torch.linspace(-0.3, 0.3, size)
+    difference[:, :15, 30:] += 7.0
+    where = torch.ones((size, size), dtype=torch.bool)
+    where[:, 40:] = False
+    difference[:, :, 40:] += 100.0
+    expected = torch.tensor([0.1, 2.0]) * math.sqrt(1 - 1 / (2 * radius + 1) ** 2)
+    torch.testing.assert_close(grain(difference, where, radius), expected, rtol=0.1, atol=0)

@@ -212,12 +212,24 @@ def test_sure_places_are_judged_apart_from_silent_ones_among_them() -> None:
     assert float(off.mean()) > 0.5 * float(right.mean())
 
 
+def with_grain(clean: Measurements, deviation: float) -> Measurements:
+    generator = torch.Generator().manual_seed(0)
+    images = [
+        (image + deviation * torch.randn(image.shape, generator=generator)).clamp(0, 1)
+        for image in clean.images
+    ]
+    return replace(clean, images=images)
+
+
+def test_grain_of_colours_is_not_taken_for_their_slope() -> None:
+    """Of what is grey: it would agree with the field as it is, and hold it there."""
+    told = shared_brightness(with_grain(scene(), 5 / 255), too_large()).positions
+    assert error(told[told[:, 1] > 0.12]) < 0.115 * TOO_LARGE
+
+
 def test_small_windows_that_go_wild_are_not_believed(monkeypatch: pytest.MonkeyPatch) -> None:
     """In noisy photographs: what a wide window does not confirm is far off more often than the rest."""
-    torch.manual_seed(0)
-    clean = scene()
-    images = [(image + 0.03 * torch.randn_like(image)).clamp(0, 1) for image in clean.images]
-    noisy = replace(clean, images=images)
+    noisy = with_grain(scene(), 0.03)
 
     def far_off() -> Tensor:
         told = shared_brightness(noisy, too_large())
@@ -234,6 +246,10 @@ def test_small_windows_that_go_wild_are_not_believed(monkeypatch: pytest.MonkeyP
 @pytest.mark.parametrize("known_up_to", [-0.55, -1.0])
 def test_nothing_is_told_without_places_to_judge_brightness_by(known_up_to: float) -> None:
     assert len(shared_brightness(scene(known_up_to=known_up_to), too_large()).weights) == 0
+
+
+def test_nothing_is_told_where_patches_tell_everything() -> None:
+    assert len(shared_brightness(scene(known_up_to=1.0), too_large(0.0)).weights) == 0
 
 
 def test_nothing_is_told_of_an_even_brightness() -> None:
