@@ -18,7 +18,7 @@ import torch
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
-from .correlation import window_sum
+from .correlation import window_sum, without_local_mean
 
 _SIGMA_OF_MEDIAN_DEVIATION = 1.4826
 """A normal law's standard deviation, beside the median of what is off its middle."""
@@ -121,9 +121,9 @@ def grain(
 
     What is off in a few places, as along an edge, has no part in it. There must be one that is known.
     """
-    count = window_sum(where[None].to(difference.dtype), radius_px).clamp(min=1)
-    means = window_sum(torch.where(where, difference, 0.0), radius_px) / count
-    return median_deviation((difference - means)[:, where])
+    known = where.to(difference.dtype)
+    rough = torch.stack([without_local_mean(channel, known, radius_px) for channel in difference])
+    return median_deviation(rough[:, where])
 
 
 def means_of_cells(

@@ -338,8 +338,8 @@ def _grain_of_colours(pair: _Compared) -> Float[Tensor, "channels"]:
     """
     where = torch.zeros_like(pair.difference[0], dtype=torch.bool)
     where.view(-1)[pair.places.pixel] = True
-    off = grain(pair.difference, where, _WIDE_PX)
-    return torch.cat([torch.zeros_like(off[:1]), off[1:]])
+    off = grain(pair.difference[1:], where, _WIDE_PX)
+    return torch.cat([off.new_zeros(1), off])
 
 
 def _off_outlines(scene: Measurements, shown: ShownPlaces) -> ShownPlaces:
