@@ -79,6 +79,7 @@ VARIANTS = (
         changes={"train.linear.seen_through": _NEXT_TO_NOTHING},
     ),
     Variant(name="without outlines inside the subject", changes={"train.linear.inner_outlines": False}),
+    Variant(name="without flat faces", changes={"train.linear.flat_faces": False}),
     Variant(name="without brightness", changes={"train.linear.brightness": 0.0}),
     Variant(name="what shines taken as matt", changes={"train.linear.may_shine": False}),
     Variant(

@@ -49,6 +49,8 @@ class LinearConfig:
     """In front of what was measured, where the field says otherwise."""
     inner_outlines: bool = True
     """Whether bridges are looked for where photographs show that one part hides another."""
+    flat_faces: bool = True
+    """Whether what is evenly bright, with its border on a plane, is taken to lie on it."""
     brightness: float = 1.0
     """Of places that brightness tells where no texture does; 0 not to look for any."""
     may_shine: bool = True

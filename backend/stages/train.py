@@ -16,6 +16,7 @@ from ..maths.grid import refined, spacing
 from ..scene import Decision, Progress, Region, StereoResult, View, within
 from .deadline import PESSIMISM, Clock, Deadline, GridCost, deadline_after, finest_grid, predicted_s
 from .detail import add_detail
+from .flat_faces import flat_faces, no_faces
 from .inner_outlines import FarSide, decision, far_sides
 from .linear_fit import LinearConfig, fit_level, start
 from .looks import Looks
@@ -76,6 +77,8 @@ def fit_surface(
         frame = region.part(frame_from_object)
         costs = [GridCost(nodes=COARSEST, seconds=clock() - began_s)]
         scene = carried(scene, views, region, frame_from_object)
+        faces = flat_faces(scene) if config.linear.flat_faces else no_faces(scene)
+        scene = faces.beside(scene)
         distance = start(scene, radius, config.levels[0])
     total = sum(config.steps) + 10 * (len(config.levels) + 1)  # detail is one more
     done, rendered, taken_back, last = 0, 0, 0, len(config.levels) - 1
@@ -116,7 +119,7 @@ def fit_surface(
     with torch.no_grad():
         detailed, of_detail = add_detail(
             scene,
-            torch.from_numpy(stereo.points.view_index).to(device),
+            torch.cat([torch.from_numpy(stereo.points.view_index).to(device), faces.views]),
             distance,
             config.detail,
             config.linear,
@@ -125,6 +128,7 @@ def fit_surface(
     made = (
         *_decisions(scene, frame, config, depth, nodes=len(distance), rendered=rendered),
         of_detail,
+        faces.decision,
         decision(told),
         *looks.decisions,
         _of_rendering(config, rendered, taken_back),
