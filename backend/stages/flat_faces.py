@@ -144,7 +144,7 @@ class _Picture:
     """Of rays, of depth 1."""
     depth: Float32[np.ndarray, "height width"]
     """Sure ones, along the axis; 0 elsewhere."""
-    measured: Float64[np.ndarray, "height width 3"]
+    measured: Float32[np.ndarray, "height width 3"]
     """Where those are: of the photograph's own pixels, one of four."""
 
     @property
@@ -215,10 +215,7 @@ def _picture(scene: Measurements, index: int) -> _Picture:
         else _SHARE * at_size(outline, camera).cpu().numpy(),
         directions=ray_directions(on_cpu, pixel_centres(camera.width, camera.height, sure.device)).numpy(),
         depth=sure.numpy(),
-        measured=torch.stack([at_size(axis, camera) for axis in measured.unbind(-1)], dim=-1)
-        .double()
-        .cpu()
-        .numpy(),
+        measured=np.stack([at_size(axis, camera).cpu().numpy() for axis in measured.unbind(-1)], axis=-1),
     )
 
 
@@ -245,7 +242,7 @@ def _plane(region: _Region, others: list[_Picture]) -> _PlaneOfRegion | None:
     picture, window = region.picture, region.window
     depth, directions = picture.depth[window], region.directions
     border = (region.apart_px <= _BORDER_PX) & (picture.outline_px[window] < 0)
-    measured = picture.measured[window]
+    measured = picture.measured[window].astype(np.float64)
     at = border & (depth > 0)
     if at.sum() < _FEWEST or (plane := plane_of_most(measured[at], _TOLERANCE)) is None:
         return None
@@ -278,12 +275,12 @@ def _places(
     rows, columns = np.nonzero(plane.between)
     kept = (rows % 2 == 0) & (columns % 2 == 0)
     at = rows[kept], columns[kept]
-    positions = torch.from_numpy(plane.places[at]).to(like)
+    positions = torch.from_numpy(plane.places[at].astype(np.float32)).to(like)
     colours = region.picture.image[:, *region.window][:, *at].T
     numbers = torch.zeros(len(positions), dtype=torch.long, device=like.device)
     return FlatFaces(
         positions=positions,
-        normals=torch.from_numpy(plane.normal).to(like).expand_as(positions),
+        normals=torch.from_numpy(plane.normal.astype(np.float32)).to(like).expand_as(positions),
         colours=torch.from_numpy(colours).to(like),
         views=numbers + view,
         faces=numbers + number,
