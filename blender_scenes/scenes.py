@@ -109,6 +109,7 @@ SCENES: dict[str, Callable[[str, int], Scene]] = {
     "thin": _single(shapes.chair, FINE),
     "genus2": _single(shapes.double_torus, FINE),
     "spots": _single(shapes.calf, SPOTS),
+    "house": _single(shapes.house, SPOTS),
     "table": _table,
 }
 

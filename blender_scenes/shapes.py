@@ -15,6 +15,7 @@ import numpy as np
 from mathutils import Matrix, Vector
 
 Point = tuple[float, float, float]
+_TURN_45 = Matrix.Rotation(np.pi / 4, 4, "Z")
 
 
 def monkey() -> Any:
@@ -87,6 +88,26 @@ def calf() -> Any:
             _ball(mesh, centre, radii=radii)
 
     return _smoothed(_object("calf", fill), subdivision=0, voxel=0.012, smoothing=25)
+
+
+def house() -> Any:
+    """A house of flat faces, 2.6 m wide: walls, a hipped roof with eaves, a chimney, a door in front."""
+    boxes: list[tuple[Point, Point]] = [
+        ((0, 0, 0.4), (1.4, 1.0, 0.8)),
+        ((0.4, 0.1, 1.15), (0.16, 0.16, 0.5)),
+        ((0, -0.52, 0.22), (0.26, 0.14, 0.44)),
+    ]
+    roof = Matrix.Translation((0, 0, 1.05)) @ Matrix.Diagonal((1.15, 0.85, 1, 1)) @ _TURN_45
+
+    def fill(mesh: Any) -> None:
+        for centre, size in boxes:
+            place = Matrix.Translation(centre) @ Matrix.Diagonal((*size, 1.0))
+            bmesh.ops.create_cube(mesh, size=1.0, matrix=place)
+        bmesh.ops.create_cone(
+            mesh, cap_ends=True, segments=4, radius1=1.15, radius2=0.0, depth=0.6, matrix=roof
+        )
+
+    return _smoothed(_object("house", fill), subdivision=0, voxel=0.01, smoothing=1)
 
 
 def vase() -> Any:

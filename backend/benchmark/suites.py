@@ -135,7 +135,7 @@ def rendered_case(
     )
 
 
-_SCENES = ("monkey", "glossy", "plaster", "thin", "genus2", "spots")
+_SCENES = ("monkey", "glossy", "plaster", "thin", "genus2", "spots", "house")
 _MESHES = (
     # The cow looks the other way and is nearly white.
     ("cow", "mesh_spot/spot.obj", ("--turn-deg", "180", "--exposure-stops", "-0.6")),
