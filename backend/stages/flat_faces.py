@@ -52,6 +52,8 @@ _SURROUNDED = 0.8
 bright, behind a step that is seen at the region's ends alone."""
 _LEAST_COSINE = 0.2
 """Between the plane's normal and the rays, from where it is told and from where it is checked."""
+_MEETS = 0.01
+"""The same of a ray that meets the plane at all."""
 _SEEN = 0.3
 """Share of a region and its border that another photograph has to show to be asked."""
 _EDGE = 3 / 255
@@ -63,6 +65,7 @@ _ALIKE = 3 / 255
 _AGREES = 0.8
 """Share of a region's pixels that are alike."""
 _AGREES_ON_EDGES = 0.72
+"""The same of those on edges, its border among them."""
 _CONTRADICTED = 0.05
 """Share of a face that may seem to lie where a photograph shows something else through it."""
 _OFF_PX = 2.0
@@ -233,8 +236,8 @@ def _even_regions(picture: _Picture) -> Iterator[_Region]:
         margin = math.ceil(max(math.sqrt(sizes[number]), _BORDER_PX)) + 1
         rows, columns = (slice(max(side.start - margin, 0), side.stop + margin) for side in box)
         window = rows, columns
-        inside = numbers[window] == number
-        yield _Region(picture=picture, window=window, inside=inside, apart_px=distance_transform_edt(~inside))
+        within = numbers[window] == number
+        yield _Region(picture=picture, window=window, inside=within, apart_px=distance_transform_edt(~within))
 
 
 def _plane(region: _Region, others: list[_Picture]) -> _PlaneOfRegion | None:
@@ -253,15 +256,17 @@ def _plane(region: _Region, others: list[_Picture]) -> _PlaneOfRegion | None:
     if plane.within.mean() < _MOST or between.sum() < _SURROUNDED * region.inside.sum():
         return None
     slope = directions @ plane.normal
-    along = -plane.distance(picture.centre) / slope
     cosine = np.abs(slope) / np.linalg.norm(directions, axis=-1)
-    if np.median(cosine[region.inside]) < _LEAST_COSINE or (along[between] <= 0).any():
+    to_plane = -plane.distance(picture.centre)
+    meets = (slope * to_plane > 0) & (cosine > _MEETS)
+    if np.median(cosine[region.inside]) < _LEAST_COSINE or not meets[between].all():
         return None
+    along = np.where(meets, to_plane / np.where(meets, slope, 1.0), 0.0)
     places = picture.centre + along[..., None] * directions
     if any(_denies_it(other, places[between]) for other in others):
         return None
     # what stereo surely measured elsewhere, as behind an edge, is not of this face
-    asked = border & (along > 0) & ~((depth > 0) & (np.abs(depth - along) > 3 * _TOLERANCE))
+    asked = border & meets & ~((depth > 0) & (np.abs(depth - along) > 3 * _TOLERANCE))
     if not any(_shows_it(other, region, plane, places, asked) for other in others):
         return None
     normal = plane.normal * np.sign(plane.distance(picture.centre))
