@@ -15,7 +15,6 @@ import numpy as np
 from mathutils import Matrix, Vector
 
 Point = tuple[float, float, float]
-_TURN_45 = Matrix.Rotation(np.pi / 4, 4, "Z")
 
 
 def monkey() -> Any:
@@ -97,7 +96,8 @@ def house() -> Any:
         ((0.4, 0.1, 1.15), (0.16, 0.16, 0.5)),
         ((0, -0.52, 0.22), (0.26, 0.14, 0.44)),
     ]
-    roof = Matrix.Translation((0, 0, 1.05)) @ Matrix.Diagonal((1.15, 0.85, 1, 1)) @ _TURN_45
+    square = Matrix.Rotation(np.pi / 4, 4, "Z")
+    roof = Matrix.Translation((0, 0, 1.05)) @ Matrix.Diagonal((1.15, 0.85, 1, 1)) @ square
 
     def fill(mesh: Any) -> None:
         for centre, size in boxes:

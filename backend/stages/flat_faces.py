@@ -13,7 +13,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-import torch.nn.functional as F
 from jaxtyping import Bool, Float, Float32, Float64, Int64
 from scipy.ndimage import distance_transform_edt, find_objects, gaussian_filter, label
 from skimage.morphology import convex_hull_image
@@ -24,7 +23,7 @@ from ..maths.plane_fit import Plane, plane_of_most
 from ..maths.rows import Rows, together
 from ..scene import Decision
 from .measurements import Measurements
-from .seen_field import at_size, smaller
+from .seen_field import at_size, averaged, smaller
 
 _SHARE = 0.5
 """Of the photographs' size at which they are looked at."""
@@ -114,7 +113,8 @@ class FlatFaces(Rows):
 
 def flat_faces(scene: Measurements) -> FlatFaces:
     """Of all photographs that know their subject, each region by itself."""
-    pictures = [_picture(scene, index) for index in range(len(scene.cameras))]
+    shown = zip(scene.cameras, scene.images, scene.certain, scene.sure_depths, strict=True)
+    pictures = [_picture(*of_one) for of_one in shown]
     found = [no_faces(scene)]
     for view, picture in enumerate(pictures):
         if not picture.knows_subject:
@@ -194,15 +194,19 @@ class _PlaneOfRegion:
     """Pixels of the region that lie between what was measured on the plane."""
 
 
-def _picture(scene: Measurements, index: int) -> _Picture:
-    full = scene.cameras[index]
+def _picture(
+    full: Pinhole,
+    image_srgb: Float[Tensor, "3 height width"],
+    outline: Float[Tensor, "height width"] | None,
+    depth: Float[Tensor, "height width"],
+) -> _Picture:
     camera = smaller(full, _SHARE)
-    small = F.interpolate(scene.images[index][None], size=(camera.height, camera.width), mode="area")[0]
-    image = np.stack([gaussian_filter(channel, _BLUR_PX) for channel in small.cpu().numpy()])
-    outline = scene.certain[index]
-    depth = scene.sure_depths[index]
-    measured = unproject(full, pixel_centres(full.width, full.height, depth.device), depth)
-    sure = at_size(depth, camera).cpu()
+    small = averaged(image_srgb, camera).cpu().numpy()
+    image = np.stack([gaussian_filter(channel, _BLUR_PX) for channel in small])
+    own = pixel_centres(full.width, full.height, depth.device)
+    pixels = torch.stack([at_size(axis, camera) for axis in own.unbind(dim=-1)], dim=-1)
+    sure = at_size(depth, camera)
+    measured = unproject(full, pixels, sure)
     on_cpu = Pinhole(
         intrinsics=camera.intrinsics.cpu(),
         camera_from_object=camera.camera_from_object.cpu(),
@@ -216,9 +220,11 @@ def _picture(scene: Measurements, index: int) -> _Picture:
         outline_px=np.full(sure.shape, -np.inf, np.float32)
         if outline is None
         else _SHARE * at_size(outline, camera).cpu().numpy(),
-        directions=ray_directions(on_cpu, pixel_centres(camera.width, camera.height, sure.device)).numpy(),
-        depth=sure.numpy(),
-        measured=np.stack([at_size(axis, camera).cpu().numpy() for axis in measured.unbind(-1)], axis=-1),
+        directions=ray_directions(
+            on_cpu, pixel_centres(camera.width, camera.height, on_cpu.intrinsics.device)
+        ).numpy(),
+        depth=sure.cpu().numpy(),
+        measured=measured.cpu().numpy(),
     )
 
 

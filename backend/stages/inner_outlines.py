@@ -14,7 +14,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-import torch.nn.functional as F
 from jaxtyping import Bool, Float, Float32, Float64
 from scipy.ndimage import binary_erosion, binary_opening, label
 from torch import Tensor
@@ -23,7 +22,7 @@ from ..maths.geometry import Pinhole
 from ..maths.random_walk import WalkEnds, walk_ends
 from ..scene import Decision
 from .measurements import Measurements
-from .seen_field import at_size, seen_field, smaller
+from .seen_field import at_size, averaged, seen_field, smaller
 
 _PIXELS = 30_000
 """Of a picture that walks go over, at most: time grows faster than they do."""
@@ -65,13 +64,12 @@ def far_sides(scene: Measurements, distance: Float[Tensor, "nodes nodes nodes"])
         if outline is None:
             continue
         small = smaller(camera, min(math.sqrt(_PIXELS / (camera.width * camera.height)), 1.0))
-        size = (small.height, small.width)
         seen = _seen(small, at_size(outline, small) < 0, distance)
         on = seen.depth > 0
         sure = at_size(confidence, small).cpu().numpy()
         measured = at_size(depth, small).cpu().numpy()
         is_known = (measured > 0) & (sure > _LEAST_CONFIDENCE)
-        picture = F.interpolate(image[None], size=size, mode="area")[0].permute(1, 2, 0).cpu().numpy()
+        picture = averaged(image, small).permute(1, 2, 0).cpu().numpy()
         ends = walk_ends(
             picture,
             on,

@@ -98,6 +98,11 @@ def smaller(camera: Pinhole, share: float) -> Pinhole:
     return camera.scaled(max(round(share * camera.width), 1), max(round(share * camera.height), 1))
 
 
+def averaged(image: Float[Tensor, "3 height width"], camera: Pinhole) -> Float[Tensor, "3 rows columns"]:
+    """Means over a smaller camera's pixels."""
+    return F.interpolate(image[None], size=(camera.height, camera.width), mode="area")[0]
+
+
 def at_size(image: Float[Tensor, "height width"], camera: Pinhole) -> Float[Tensor, "rows columns"]:
     """The nearest values, at a smaller camera's pixels."""
     size = (camera.height, camera.width)

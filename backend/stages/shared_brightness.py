@@ -38,7 +38,7 @@ from ..maths.mirrored_light import means_of_bins, mirrored_bins
 from ..maths.rows import Rows, together
 from ..maths.srgb import linear_from_srgb
 from .measurements import SURE, Measurements
-from .seen_field import NearSurface, at_size, may_show, seen_field, smaller
+from .seen_field import NearSurface, at_size, averaged, may_show, seen_field, smaller
 from .shine import Boxes, Shine, deviations, mirrored_by
 from .stereo_windows import neighbours
 
@@ -208,7 +208,7 @@ def _picture(
     wanted = inner[asked]
     return _Picture(
         camera=camera,
-        linear=_blurred(scene.images[index], depth > 0),
+        linear=_blurred(averaged(scene.images[index], camera), depth > 0),
         depth=torch.where(inner, depth, 0.0),
         places=_Places(
             pixel=torch.nonzero(asked.flatten())[wanted, 0],
@@ -238,11 +238,10 @@ def _evened(
 
 
 def _blurred(
-    image_srgb: Float[Tensor, "3 height width"], seen: Bool[Tensor, "rows columns"]
+    image_srgb: Float[Tensor, "3 rows columns"], seen: Bool[Tensor, "rows columns"]
 ) -> Float[Tensor, "3 rows columns"]:
     """Linear light, blurred over the seen pixels alone."""
-    small = F.interpolate(image_srgb[None], size=tuple(seen.shape), mode="area")[0]
-    linear, on = linear_from_srgb(small.cpu().numpy()), seen.cpu().numpy().astype(np.float32)
+    linear, on = linear_from_srgb(image_srgb.cpu().numpy()), seen.cpu().numpy().astype(np.float32)
     share = gaussian_filter(on, _BLUR_PX).clip(min=1e-6)
     blurred = np.stack([gaussian_filter(channel * on, _BLUR_PX) / share for channel in linear])
     return torch.tensor(blurred, dtype=torch.float32, device=seen.device)

@@ -1,6 +1,5 @@
 """A board with a square painted on it, measured along the paint's border alone; and a ball with a spot."""
 
-import math
 from dataclasses import replace
 
 import pytest
@@ -14,6 +13,7 @@ from backend.maths.grid import node_positions, read
 from backend.stages.flat_faces import FlatFaces, flat_faces, no_faces
 from backend.stages.linear_fit import LinearConfig, fit_level
 from backend.stages.measurements import Measurements
+from tests.turned_camera import ball_depth, turned_camera
 
 SIZE = 320
 NORMAL = F.normalize(torch.tensor([0.2, 0.3, -1.0]), dim=0)
@@ -31,15 +31,7 @@ Points = Float[Tensor, "height width 3"]
 
 
 def camera(angle_deg: float) -> Pinhole:
-    """Three units away from the middle, turned about y."""
-    a = math.radians(angle_deg)
-    camera_from_object = torch.eye(4)
-    camera_from_object[:3, :3] = torch.tensor(
-        [[math.cos(a), 0, -math.sin(a)], [0, 1, 0], [math.sin(a), 0, math.cos(a)]]
-    )
-    camera_from_object[2, 3] = 3.0
-    intrinsics = torch.tensor([[500.0, 0, SIZE / 2], [0, 500, SIZE / 2], [0, 0, 1]])
-    return Pinhole(intrinsics=intrinsics, camera_from_object=camera_from_object, width=SIZE, height=SIZE)
+    return turned_camera(angle_deg, focal_px=500.0, size=SIZE)
 
 
 def rays(one: Pinhole) -> Points:
@@ -114,11 +106,8 @@ def ball(*, lit_from_aside: float) -> Measurements:
     light = F.normalize(torch.tensor([1.0, 0.5, -0.7]), dim=0)
     images, on, depths = [], [], []
     for one in cameras:
-        directions = rays(one)
-        a, b = directions.square().sum(-1), directions @ one.position
-        root = b * b - a * (one.position.square().sum() - RADIUS**2)
-        on.append(root > 0)
-        depth = torch.where(on[-1], (-b - root.clamp(min=0).sqrt()) / a, 0.0)
+        depth = ball_depth(one, RADIUS)
+        on.append(depth > 0)
         normals = F.normalize(at_depth(one, depth), dim=-1)
         spot = -normals[..., 2] > SPOT
         shade = 1 - lit_from_aside + lit_from_aside * (normals @ light).clamp(min=0)

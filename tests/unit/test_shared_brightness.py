@@ -10,7 +10,7 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
-from backend.maths.geometry import Pinhole, pixel_centres, project, ray_directions, unproject
+from backend.maths.geometry import Pinhole, pixel_centres, project, unproject
 from backend.maths.grid import locate, node_positions, read, spacing, value_and_gradient
 from backend.maths.mirrored_light import BINS
 from backend.maths.srgb import srgb_from_linear
@@ -22,6 +22,7 @@ from backend.stages.looks import Looks
 from backend.stages.measurements import SURE, Measurements
 from backend.stages.shared_brightness import ShownPlaces, share_told, shared_brightness, textured
 from backend.stages.shine import Boxes, deviations, mirrored_by
+from tests.turned_camera import ball_depth, turned_camera
 
 NODES, SIZE, RADIUS = 64, 320, 0.6
 TOO_LARGE = 0.03
@@ -34,15 +35,7 @@ Field = Float[Tensor, "nodes nodes nodes"]
 
 
 def camera(angle_deg: float) -> Pinhole:
-    """Three units away from the middle, turned about y."""
-    a = math.radians(angle_deg)
-    camera_from_object = torch.eye(4)
-    camera_from_object[:3, :3] = torch.tensor(
-        [[math.cos(a), 0, -math.sin(a)], [0, 1, 0], [math.sin(a), 0, math.cos(a)]]
-    )
-    camera_from_object[2, 3] = 3.0
-    intrinsics = torch.tensor([[600.0, 0, SIZE / 2], [0, 600, SIZE / 2], [0, 0, 1]])
-    return Pinhole(intrinsics=intrinsics, camera_from_object=camera_from_object, width=SIZE, height=SIZE)
+    return turned_camera(angle_deg, focal_px=600.0, size=SIZE)
 
 
 def too_large(by: float = TOO_LARGE) -> Field:
@@ -62,11 +55,8 @@ def scene(
     cameras = [camera(-12), camera(12)]
     images, outlines, depths, confidences, positions = [], [], [], [], []
     for index, one in enumerate(cameras):
-        rays = ray_directions(one, pixel_centres(SIZE, SIZE, torch.device("cpu")))
-        a, b = (rays * rays).sum(-1), (rays * one.position).sum(-1)
-        root = b * b - a * (one.position.square().sum() - RADIUS**2)
-        on = root > 0
-        depth = torch.where(on, (-b - root.clamp(min=0).sqrt()) / a, 0.0)
+        depth = ball_depth(one, RADIUS)
+        on = depth > 0
         points = unproject(one, pixel_centres(SIZE, SIZE, torch.device("cpu")), depth)
         normals = points / RADIUS
         matt = 0.05 + 0.6 * (normals @ LIGHT).clamp(min=0)
