@@ -2,11 +2,14 @@
 
 The first sweep sees little of what is narrow there, a recess or a bar behind an edge, and gives it the depth
 of what stands before it. Refinement and growth change depths a little at a time and never cross such a jump.
+Nor does it see a face that turns away, for its planes do not: such a face is grown into from beside it, but
+past a crease there is nothing to grow from. So planes that lean are tried as well.
 """
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 
 import numpy as np
 import torch
@@ -29,11 +32,15 @@ from .patch_agreement import agreement
 from .stereo_config import StereoConfig
 from .stereo_windows import Window
 
+Lean = tuple[float, float]
+"""How many pixels the match moves more from a pixel to the next on its right, and to the next below."""
+UPRIGHT: Lean = (0.0, 0.0)
+"""Of planes that face the camera: all of their match moves alike."""
 _AT_A_TIME = 16
 """Planes that are compared before the next are thought of."""
 _FARTHEST = 0.02
 """Of the inverse depth at the region's end: nothing farther off moves between photographs."""
-_AGREES_BETTER = 0.05
+AGREES_BETTER = 0.05
 """By that much it has to, at a depth that takes the place of another."""
 _FEWEST_MEASURED = 100
 """Pixels, that say between which depths to look again."""
@@ -67,7 +74,7 @@ def subject_of(window: Window) -> Subject | None:
 
 def better_of(one: Map, other: Map) -> Map:
     """The other map, but the one's depths where patches agree clearly better."""
-    kept = one.score > other.score + _AGREES_BETTER
+    kept = one.score > other.score + AGREES_BETTER
     return replace(
         other,
         inverse_depth=torch.where(kept, one.inverse_depth, other.inverse_depth),
@@ -108,6 +115,7 @@ def swept_again(
     sources: list[Window],
     subjects: list[Subject],
     config: StereoConfig,
+    leans: Sequence[Lean] = (UPRIGHT,),
 ) -> Map:
     """The best plane of what is textured but not `measured`, of all between which anything is.
 
@@ -122,20 +130,43 @@ def swept_again(
     far, near = np.quantile(current.inverse_depth[sure].cpu().numpy(), [0.001, 0.999])
     pixels = torch.nonzero(asked.flatten())[:, 0]
     score, inverse_depth = current.score.flatten().clone(), current.inverse_depth.flatten().clone()
-    best = (score[pixels] + _AGREES_BETTER).clamp(min=config.growth_correlation)
-    for some in torch.split(_planes(window, sources, far, near, config), _AT_A_TIME):
-        found = agreement(window, sources, _over(window, some), asked).flatten(1)[:, pixels]
+    best = (score[pixels] + AGREES_BETTER).clamp(min=config.growth_correlation)
+    planes = _planes(window, sources, far, near, config)
+    a_pixel = _step(window, sources, far, near)
+    for lean, some in product(leans, torch.split(planes, _AT_A_TIME)):
+        hypotheses = _over(window, some) if lean == UPRIGHT else leaning(window, some, planes, a_pixel, lean)
+        tried = hypotheses.flatten(1)[:, pixels]
+        found = agreement(window, sources, hypotheses, asked).flatten(1)[:, pixels]
         plane, pixel = torch.nonzero(found > best, as_tuple=True)
-        off = ~_may_be(window, subjects, pixels[pixel], some[plane])
+        off = ~_may_be(window, subjects, pixels[pixel], tried[plane, pixel])
         found[plane[off], pixel[off]] = -1.0
         top, index = found.max(dim=0)
         better = top > best
         best = torch.where(better, top, best)
         score[pixels[better]] = top[better]
-        inverse_depth[pixels[better]] = some[index[better]]
+        inverse_depth[pixels[better]] = tried.gather(0, index[None])[0, better]
     return replace(
         current, inverse_depth=inverse_depth.view_as(window.grey), score=score.view_as(window.grey)
     )
+
+
+def leaning(
+    window: Window,
+    some: Float[Tensor, "some_planes"],
+    planes: Float[Tensor, "planes"],
+    a_pixel: float,
+    lean: Lean,
+) -> Float[Tensor, "some_planes height width"]:
+    """Inverse depths of some of the planes, leaning: all together, they ask each pixel for each depth once.
+
+    Where one leaves the depths of all planes at their near end it comes in again at the far one. That is a
+    jump, but on each plane at another place. `a_pixel` is the change of inverse depth that moves the match
+    by a pixel.
+    """
+    far, step = planes[0], planes[1] - planes[0]
+    pixels = pixel_centres(window.camera.width, window.camera.height, window.grey.device)
+    moved = a_pixel * (lean[0] * pixels[..., 0] + lean[1] * pixels[..., 1])
+    return far + (some[:, None, None] - far + moved).remainder(len(planes) * step)
 
 
 def inverse_depth_range(camera: Pinhole) -> tuple[float, float]:
@@ -165,10 +196,15 @@ def _planes(
     window: Window, sources: list[Window], far: float, near: float, config: StereoConfig
 ) -> Float[Tensor, "planes"]:
     """Inverse depths from far to near, about a pixel apart in the source where matches move most."""
-    middle = torch.full_like(window.grey, (near + far) / 2)
-    step = min(float(step_of_one_pixel(window, [source], middle).median()) for source in sources)
+    step = _step(window, sources, far, near)
     count = int(np.clip(math.ceil((near - far) / step), 16, config.num_planes)) + 1
     return torch.linspace(far, near, count, device=window.grey.device)
+
+
+def _step(window: Window, sources: list[Window], far: float, near: float) -> float:
+    """The usual change of inverse depth that moves matches by a pixel in the source where they move most."""
+    middle = torch.full_like(window.grey, (near + far) / 2)
+    return min(float(step_of_one_pixel(window, [source], middle).median()) for source in sources)
 
 
 def _over(window: Window, planes: Float[Tensor, "planes"]) -> Float[Tensor, "planes height width"]:

@@ -15,6 +15,7 @@ from backend.stages.plane_sweep import (
     Map,
     better_of,
     inverse_depth_range,
+    leaning,
     step_of_one_pixel,
     subject_of,
     swept_again,
@@ -203,7 +204,9 @@ def test_what_lies_behind_a_slot_is_measured() -> None:
     views, depths = zip(*(seen(camera, i) for i, camera in enumerate(cameras)), strict=True)
     shares = []
     for sweep_again in (False, True):
-        found = matched(views, StereoConfig(sweep_again=sweep_again, coarse_pixels=5_000, min_piece_px=50))
+        found = matched(
+            views, StereoConfig(sweep_again=sweep_again, lean=0.0, coarse_pixels=5_000, min_piece_px=50)
+        )
         through = [np.isfinite(depth) for depth in depths]
         assert min(there.sum() for there in through) > 300
         right = [
@@ -224,3 +227,71 @@ def test_depths_that_are_found_agree_as_their_score_says() -> None:
         one.window, [windows()[0], windows()[2]], found.inverse_depth[None], one.window.subject
     )[0]
     assert (scores - found.score).abs()[took].median() < 0.1
+
+
+# a face that turns away past a crease: no plane to grow from, and none of those that face the camera
+
+TURNED_DEG = 64.0
+"""Between the board and the face that goes back from its left side."""
+
+
+def board_and_side() -> RayCaster:
+    """They meet in an edge off the middle, along z."""
+    turned = np.radians(TURNED_DEG)
+    back = 1.1 * SIZE * np.array([-np.cos(turned), np.sin(turned)])
+    edge = CENTRE[:2] - [0.05 * SIZE, 0.4 * SIZE]
+    right = np.array([0.5 * SIZE, 0.0])
+    ends = [edge + right, edge, edge + back]
+    corners = [[*end, CENTRE[2] + z] for end in ends for z in (-0.5 * SIZE, 0.5 * SIZE)]
+    return RayCaster(np.array(corners), np.array([[0, 2, 3], [0, 3, 1], [2, 4, 5], [2, 5, 3]]))
+
+
+def seen_side(camera: Camera, index: int) -> tuple[View, np.ndarray]:
+    """The view, and the depth of the face that turns away."""
+    origins, directions = camera_rays(camera)
+    hits, shape = board_and_side().cast(origins, directions), (camera.height, camera.width)
+    image, depth = np.zeros((len(origins), 3), np.float32), np.full(len(origins), np.nan)
+    points = origins[hits.hit] + hits.distance[hits.hit, None] * directions[hits.hit]
+    image[hits.hit] = texture_srgb(points)
+    along = (points - camera.position) @ camera.camera_from_world[2, :3] / OBJECT_UNIT
+    depth[hits.hit] = np.where(hits.face[hits.hit] >= 2, along, np.nan)
+    mask = hits.hit.reshape(shape).astype(np.float32)
+    view = View(name=f"{index}.png", camera=camera, image_srgb=image.reshape(*shape, 3), mask=mask)
+    return view, depth.reshape(shape)
+
+
+def test_a_face_that_turns_away_past_a_crease_is_measured() -> None:
+    """More than without such planes, and more than with as many that hardly lean."""
+    views, depths = zip(
+        *(seen_side(camera_at(azimuth, 0.0, 480), i) for i, azimuth in enumerate((-15, 10))), strict=True
+    )
+    shares = []
+    for lean in (0.0, 1e-6, 0.7):
+        found = matched(views, StereoConfig(lean=lean, coarse_pixels=20_000))
+        right = [
+            (np.abs(map_.depth / depth - 1) < 0.01)[np.isfinite(depth)]
+            for map_, depth in zip(found.depth_maps, depths, strict=True)
+        ]
+        assert min(len(there) for there in right) > 1000
+        shares.append(float(np.concatenate(right).mean()))
+    assert shares[2] > 2 * shares[0], shares
+    assert shares[2] > 1.4 * shares[1], shares
+
+
+@pytest.mark.parametrize("lean", [(0.7, 0.0), (-0.7, 0.0), (0.0, 0.7), (0.4, -0.4)])
+def test_leaning_planes_ask_each_pixel_for_each_depth_once(lean: tuple[float, float]) -> None:
+    """And from a pixel to the next the match moves as they lean, but where they begin anew."""
+    window = windows()[1]
+    planes = torch.linspace(0.5, 0.9, 41)
+    step, a_pixel = 0.01, 0.013
+    tried = leaning(window, planes, planes, a_pixel, lean)
+    assert tried.shape == (41, *window.grey.shape)
+    assert (tried >= 0.5 - 1e-6).all()
+    assert (tried <= 0.9 + step + 1e-6).all()
+    in_order = tried.sort(dim=0).values
+    torch.testing.assert_close(in_order.diff(dim=0), torch.full_like(in_order[1:], step), rtol=0, atol=1e-5)
+    for slope, change in ((lean[0], tried.diff(dim=2)), (lean[1], tried.diff(dim=1))):
+        goes_on = (change - slope * a_pixel).abs() < 1e-5
+        assert goes_on.float().mean() > 0.97
+        anew = (change - slope * a_pixel).abs() - 41 * step
+        assert (anew[~goes_on].abs() < 1e-5).all()

@@ -88,8 +88,8 @@ def test_surface_that_turns_away_is_grown_from_its_neighbour() -> None:
     swept, grown = (
         match_views(wide.views, true_region(), config, device=torch.device("cpu"), progress=no_progress)
         for config in (
-            StereoConfig(sweep_again=False, growth_rounds=(0, 0, 0)),
-            StereoConfig(sweep_again=False),
+            StereoConfig(sweep_again=False, lean=0.0, growth_rounds=(0, 0, 0)),
+            StereoConfig(sweep_again=False, lean=0.0),
         )
     )
     missed = [
