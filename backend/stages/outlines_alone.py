@@ -19,9 +19,23 @@ _MOST_OF_EDGE = 0.5
 """Of a picture's edge that may show the subject: more is a mask of what is around it."""
 
 
+def check_pictures(views: tuple[View, ...]) -> None:
+    """Raises ReconstructionError(PHOTO_UNREADABLE) for values that are not numbers.
+
+    They spoil what they are compared with, and the colours.
+    """
+    for view in views:
+        if not np.isfinite(view.image_srgb).all():
+            raise ReconstructionError(
+                ErrorCode.PHOTO_UNREADABLE,
+                f"The photograph {view.name} has pixels whose values are not numbers.",
+                "Export it again, as JPEG, PNG or 16-bit TIFF.",
+            )
+
+
 def check_enough(points: SurfacePoints, views: tuple[View, ...]) -> None:
     """Raises ReconstructionError(NO_SURFACE) where neither points nor outlines tell the shape."""
-    told = sum(map(_shows_outline, views)) >= FEWEST_OUTLINES and _are_pictures(views)
+    told = sum(map(_shows_outline, views)) >= FEWEST_OUTLINES
     if told or len(points.positions) >= FEWEST_POINTS:
         return
     masked = any(view.mask is not None for view in views)
@@ -41,11 +55,6 @@ def _shows_outline(view: View) -> bool:
     edge = np.ones(view.mask.shape, np.bool_)
     edge[1:-1, 1:-1] = False
     return bool((view.mask[edge] > 0.5).mean() <= _MOST_OF_EDGE)
-
-
-def _are_pictures(views: tuple[View, ...]) -> bool:
-    """Whether all are numbers: one that is not spoils what it is compared with, and the colours."""
-    return all(bool(np.isfinite(view.image_srgb).all()) for view in views)
 
 
 def no_points() -> SurfacePoints:

@@ -23,7 +23,7 @@ from ..maths.inverse_depth import fit_planes, normals_from_planes
 from ..maths.texture import leverage
 from ..scene import DepthMap, Progress, Region, StereoResult, SurfacePoints, View, within
 from .depth_maps import Measured, depth_maps
-from .outlines_alone import FEWEST_POINTS, check_enough, no_points, outlines_alone
+from .outlines_alone import FEWEST_POINTS, check_enough, check_pictures, no_points, outlines_alone
 from .stereo_config import StereoConfig
 from .stereo_windows import neighbours, pyramid, sees_region
 from .strays import without_strays
@@ -35,8 +35,10 @@ def match_views(
     """Depth maps and points of all views, object frame.
 
     Raises ReconstructionError(NO_SURFACE) if the photographs agree on next to nothing and hardly any has a
-    mask; with masks there are no points then, and a decision says so.
+    mask; with masks there are no points then, and a decision says so. Raises PHOTO_UNREADABLE if one has
+    values that are not numbers.
     """
+    check_pictures(views)
     with torch.no_grad():
         pyramids = [pyramid(view, region, config, device) for view in views]
         nearby = neighbours([sizes[0].camera for sizes in pyramids], config.num_sources)

@@ -232,7 +232,7 @@ PHOTOGRAPHS = {
     "something moving, no masks": Spoiled(
         scene=unmasked, change=with_something_moving, becomes=WITHOUT_MASKS
     ),
-    "not a number": Spoiled(scene=masked, change=not_a_number, becomes=ErrorCode.NO_SURFACE),
+    "not a number": Spoiled(scene=masked, change=not_a_number, becomes=ErrorCode.PHOTO_UNREADABLE),
 }
 
 
