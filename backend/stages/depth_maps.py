@@ -152,6 +152,8 @@ def _swept_again(
         others = [one for i, one in enumerate(subjects) if one is not None and i != index]
         swept = swept_again(maps[index], measured[index], near, others, config, leans)
         again.append(_improved(swept, near, [0.5], config))
+    if not config.lean:
+        return again
     measured = [_votes(index, again, nearby, config) > 0 for index in range(len(again))]
     told = [
         with_depths_of(again[index], measured[index], [(again[k], measured[k]) for k in near], views, config)
