@@ -88,7 +88,7 @@ def sweep(window: Window, sources: list[Window], config: StereoConfig) -> Map:
         nothing = torch.zeros_like(window.grey)
         return Map(window=window, inverse_depth=nothing, score=nothing, behind=nothing)
     near, far = inverse_depth_range(window.camera)
-    planes = _planes(window, sources, far, near, config)
+    planes = _planes(window, _step(window, sources, far, near), far, near, config)
     score = torch.cat(list(_tried(window, sources, planes)))
     cost = (1 - score).permute(1, 2, 0).contiguous()
     if config.semi_global:
@@ -131,12 +131,13 @@ def swept_again(
     pixels = torch.nonzero(asked.flatten())[:, 0]
     score, inverse_depth = current.score.flatten().clone(), current.inverse_depth.flatten().clone()
     best = (score[pixels] + AGREES_BETTER).clamp(min=config.growth_correlation)
-    planes = _planes(window, sources, far, near, config)
     a_pixel = _step(window, sources, far, near)
+    planes = _planes(window, a_pixel, far, near, config)
     for lean, some in product(leans, torch.split(planes, _AT_A_TIME)):
         hypotheses = _over(window, some) if lean == UPRIGHT else leaning(window, some, planes, a_pixel, lean)
-        tried = hypotheses.flatten(1)[:, pixels]
-        found = agreement(window, sources, hypotheses, asked).flatten(1)[:, pixels]
+        tried, found = (
+            values[:, asked] for values in (hypotheses, agreement(window, sources, hypotheses, asked))
+        )
         plane, pixel = torch.nonzero(found > best, as_tuple=True)
         off = ~_may_be(window, subjects, pixels[pixel], tried[plane, pixel])
         found[plane[off], pixel[off]] = -1.0
@@ -193,10 +194,9 @@ def step_of_one_pixel(
 
 
 def _planes(
-    window: Window, sources: list[Window], far: float, near: float, config: StereoConfig
+    window: Window, step: float, far: float, near: float, config: StereoConfig
 ) -> Float[Tensor, "planes"]:
-    """Inverse depths from far to near, about a pixel apart in the source where matches move most."""
-    step = _step(window, sources, far, near)
+    """Inverse depths from far to near, about a step apart."""
     count = int(np.clip(math.ceil((near - far) / step), 16, config.num_planes)) + 1
     return torch.linspace(far, near, count, device=window.grey.device)
 
