@@ -46,7 +46,7 @@ VARIANTS = (
     Variant(name="as it is"),
     # what stereo points are, and what they weigh
     Variant(name="without a second sweep", changes={"stereo.sweep_again": False}),
-    Variant(name="with leaning planes", changes={"stereo.lean": 0.7}),
+    Variant(name="without leaning planes", changes={"stereo.lean": 0.0}),
     Variant(name="without growth", changes={"stereo.growth_rounds": (0, 0, 0)}),
     Variant(name="without semi-global matching", changes={"stereo.semi_global": False}),
     Variant(

@@ -9,7 +9,7 @@ from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 
 from ..maths.geometry import Pinhole, pinhole_in_object
-from ..scene import Region, StereoResult, View
+from ..scene import Region, StereoResult, SurfacePoints, View
 
 SURE = 0.3
 """Confidence of a depth that carves, or that opens a scene at the pictures' edges.
@@ -57,8 +57,9 @@ def measurements(
     outlines = [_outline_or_none(view.mask, device) for view in views]
     empty = [None if m.empty is None else ~m.empty for m in stereo.depth_maps]
     subject = [_outline_or_none(m.subject, device) for m in stereo.depth_maps]
+    cameras = [pinhole_in_object(view.camera, region, device) for view in views]
     return Measurements(
-        cameras=[pinhole_in_object(view.camera, region, device) for view in views],
+        cameras=cameras,
         images=[torch.tensor(view.image_srgb, device=device).permute(2, 0, 1) for view in views],
         backdrops=[_outline_or_none(known, device) for known in empty],
         certain=[on if o is None else o for o, on in zip(outlines, subject, strict=True)],
@@ -67,7 +68,7 @@ def measurements(
         depths=[torch.tensor(map_.depth, device=device) for map_ in stereo.depth_maps],
         confidences=[torch.tensor(map_.confidence, device=device) for map_ in stereo.depth_maps],
         positions=torch.tensor(points.positions, device=device),
-        normals=torch.tensor(points.normals, device=device),
+        normals=_towards_their_views(points, cameras),
         colours=torch.tensor(points.colours_srgb, device=device),
         confidence=torch.tensor(points.confidence, device=device),
         region_centre=torch.zeros(3, device=device),
@@ -96,6 +97,20 @@ def carried(
         region_centre=middle,
         region_radius=scale,
     )
+
+
+def _towards_their_views(points: SurfacePoints, cameras: list[Pinhole]) -> Float[Tensor, "points 3"]:
+    """Normals on the side of the view that measured the point, for what it shows is an outside.
+
+    Without that, normals of which half are turned round tear the surface, the more the more there are.
+    """
+    device = cameras[0].position.device
+    normals = torch.tensor(points.normals, device=device)
+    eyes = torch.stack([camera.position for camera in cameras])[
+        torch.tensor(points.view_index, device=device)
+    ]
+    inwards = ((eyes - torch.tensor(points.positions, device=device)) * normals).sum(dim=-1) < 0
+    return torch.where(inwards[:, None], -normals, normals)
 
 
 def _outline_or_none(

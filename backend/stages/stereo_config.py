@@ -19,9 +19,9 @@ class StereoConfig:
     """Whether depth is made smooth there; else each pixel chooses for itself."""
     sweep_again: bool = True
     """Whether all depths are tried again, at the first size, where nothing was measured so far."""
-    lean: float = 0.0
+    lean: float = 0.7
     """Of planes that are tried where nothing was measured, to each of four sides: pixels that their match
-    moves more from a pixel to the next, such as 0.7. 0 for none, and then views do not ask each other either.
+    moves more from a pixel to the next. 0 for none.
     """
     patch_radius: int = 3
     """Half width of the patches, in pixels of the size at hand."""

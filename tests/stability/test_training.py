@@ -245,8 +245,9 @@ def test_a_few_pixels_that_are_no_numbers_cost_a_few_steps() -> None:
     assert with_it.steps == 40
     assert 0 < with_it.taken_back < PATIENCE
     assert with_it.distance.isfinite().all()
-    apart = float((with_it.distance - without.distance).abs().max())
-    assert apart < 0.5 * moved(without), "what was learnt ten steps before is kept"
+    learnt, all_of_it = (field.distance - torch.from_numpy(linear().distance) for field in (with_it, without))
+    # of two seeds' steps, without such a pixel, 0.70 to 0.87 have one direction
+    assert (learnt * all_of_it).sum() > 0.7 * all_of_it.square().sum(), "ten steps before is kept"
     because = told(fitted(one_pixel, 40)).because
     assert because.startswith(f"the preset; {with_it.taken_back} steps led to numbers that are not finite")
 

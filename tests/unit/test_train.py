@@ -390,7 +390,7 @@ def test_the_report_says_why_brightness_was_left_out() -> None:
         decision_on(limited(budget_s, steps=0), "brightness without texture") for budget_s in (None, 0.5)
     )
     assert whole.choice == stopped.choice == "left out"
-    assert "patches tell 7" in whole.because
+    assert "patches tell 8" in whole.because
     assert "time" in stopped.because
 
 
