@@ -4,7 +4,7 @@ Names: `intrinsics` is K (3x3), pixel = K X / depth; `b_from_a` are 4x4 rigid tr
 (column, row) with the centre of the top left pixel at (0.5, 0.5); inverse depth is 1 / z, not 1 / distance.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 
 import torch
@@ -28,6 +28,12 @@ class Pinhole:
     def position(self) -> Float[Tensor, "3"]:
         """Centre of projection, object frame."""
         return -self.camera_from_object[:3, :3].T @ self.camera_from_object[:3, 3]
+
+    def cpu(self) -> "Pinhole":
+        """The same camera in the processor's memory."""
+        return replace(
+            self, intrinsics=self.intrinsics.cpu(), camera_from_object=self.camera_from_object.cpu()
+        )
 
     def scaled(self, width: int, height: int) -> "Pinhole":
         """The same camera over an image of another size."""

@@ -18,7 +18,7 @@ from ..maths.inverse_depth import (
 from ..maths.median import median_3x3
 from ..scene import Progress, within
 from .cross_check import cross_check
-from .depths_of_others import with_depths_of
+from .depths_of_others import unconfirmed, with_depths_of
 from .patch_agreement import agreement
 from .plane_sweep import (
     UPRIGHT,
@@ -162,8 +162,9 @@ def _told_by_others(
 ) -> list[Map]:
     """What other views found tried where views agree on nothing."""
     measured = [_votes(index, maps, nearby, config) > 0 for index in range(len(maps))]
+    places = [unconfirmed(map_, known, config) for map_, known in zip(maps, measured, strict=True)]
     told = [
-        with_depths_of(maps[index], measured[index], [(maps[k], measured[k]) for k in near], views, config)
+        with_depths_of(maps[index], measured[index], [places[k] for k in near], views, config)
         for index, (near, views) in enumerate(zip(nearby, sources, strict=True))
     ]
     return [_improved(map_, near, [0.5], config) for map_, near in zip(told, sources, strict=True)]

@@ -28,19 +28,28 @@ _DEEP_PX = 4.0
 """Of the match: what lies farther behind the nearest of them is seen through the gaps between them."""
 
 
+def unconfirmed(
+    map_: Map, measured: Bool[Tensor, "height width"], config: StereoConfig
+) -> Float[Tensor, "places 3"]:
+    """Where a view's patches agree with some view, though no view has found the same; object frame."""
+    where = map_.window.subject & ~measured & (map_.score > config.growth_correlation)
+    camera = map_.window.camera
+    pixels = pixel_centres(camera.width, camera.height, where.device)[where]
+    return unproject(camera, pixels, 1 / map_.inverse_depth[where].clamp(min=1e-6))
+
+
 def with_depths_of(
     own: Map,
     measured: Bool[Tensor, "height width"],
-    others: list[tuple[Map, Bool[Tensor, "_rows _columns"]]],
+    others: list[Float[Tensor, "_places 3"]],
     sources: list[Window],
     config: StereoConfig,
 ) -> Map:
-    """The map, with depths of others that are not measured either where its patches agree better there."""
+    """The map, with `unconfirmed` places of others where it has no depth and patches agree better there."""
     window = own.window
-    found = [_found(other, known, config) for other, known in others]
-    if not found or not sources:
+    if not others or not sources:
         return own
-    nearest = _nearest_seen(window.camera, torch.cat(found))
+    nearest = _nearest_seen(window.camera, torch.cat(others))
     in_front = F.max_pool2d(nearest[None], 2 * _AROUND_PX + 1, stride=1, padding=_AROUND_PX)[0]
     behind = nearest < in_front - _DEEP_PX * step_of_one_pixel(window, sources, in_front)
     known = ((nearest > 0) & ~behind).float()
@@ -57,16 +66,6 @@ def with_depths_of(
         inverse_depth=torch.where(better, tried, own.inverse_depth),
         score=torch.where(better, score, own.score),
     )
-
-
-def _found(
-    other: Map, measured: Bool[Tensor, "height width"], config: StereoConfig
-) -> Float[Tensor, "places 3"]:
-    """Where another view's patches agree with some view, though no view has found the same."""
-    window = other.window
-    where = window.subject & ~measured & (other.score > config.growth_correlation)
-    pixels = pixel_centres(window.camera.width, window.camera.height, where.device)[where]
-    return unproject(window.camera, pixels, 1 / other.inverse_depth[where].clamp(min=1e-6))
 
 
 def _nearest_seen(camera: Pinhole, places: Float[Tensor, "places 3"]) -> Float[Tensor, "height width"]:

@@ -201,18 +201,13 @@ def _picture(
     depth: Float[Tensor, "height width"],
 ) -> _Picture:
     camera = smaller(full, _SHARE)
+    on_cpu = camera.cpu()
     small = averaged(image_srgb, camera).cpu().numpy()
     image = np.stack([gaussian_filter(channel, _BLUR_PX) for channel in small])
     own = pixel_centres(full.width, full.height, depth.device)
     pixels = torch.stack([at_size(axis, camera) for axis in own.unbind(dim=-1)], dim=-1)
     sure = at_size(depth, camera)
     measured = unproject(full, pixels, sure)
-    on_cpu = Pinhole(
-        intrinsics=camera.intrinsics.cpu(),
-        camera_from_object=camera.camera_from_object.cpu(),
-        width=camera.width,
-        height=camera.height,
-    )
     return _Picture(
         camera=on_cpu,
         image=image,

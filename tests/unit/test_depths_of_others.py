@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from backend.stages.depths_of_others import with_depths_of
+from backend.stages.depths_of_others import unconfirmed, with_depths_of
 from backend.stages.plane_sweep import Map, inverse_depth_range, step_of_one_pixel
 from backend.stages.stereo_config import StereoConfig
 from backend.stages.stereo_windows import Window, pyramid
@@ -45,10 +45,15 @@ def nowhere(window: Window) -> Tensor:
     return torch.zeros_like(window.subject)
 
 
+def of_the_left() -> list[Tensor]:
+    """What it alone has found."""
+    return [unconfirmed(true_map(), nowhere(LEFT), CONFIG)]
+
+
 def test_what_another_view_found_is_found_as_well() -> None:
     """Within half a pixel of disparity, nearly everywhere that both see."""
     own = nothing_found()
-    told = with_depths_of(own, nowhere(MIDDLE), [(true_map(), nowhere(LEFT))], [LEFT, RIGHT], CONFIG)
+    told = with_depths_of(own, nowhere(MIDDLE), of_the_left(), [LEFT, RIGHT], CONFIG)
     took = told.inverse_depth != own.inverse_depth
     step = step_of_one_pixel(MIDDLE, [LEFT, RIGHT], truth(1, MIDDLE).clamp(min=1e-3))
     off = (told.inverse_depth - truth(1, MIDDLE)).abs() / step
@@ -63,7 +68,7 @@ def test_what_another_view_found_is_found_as_well() -> None:
 def test_only_what_is_not_measured_is_asked() -> None:
     own, left_half = nothing_found(), nowhere(MIDDLE)
     left_half[:, : left_half.shape[1] // 2] = True
-    told = with_depths_of(own, left_half, [(true_map(), nowhere(LEFT))], [LEFT, RIGHT], CONFIG)
+    told = with_depths_of(own, left_half, of_the_left(), [LEFT, RIGHT], CONFIG)
     took = told.inverse_depth != own.inverse_depth
     assert took.sum() > 5000
     assert not took[left_half].any()
@@ -79,7 +84,7 @@ def test_nothing_is_taken(case: str) -> None:
             measured = ~measured
         case "other agrees with nothing":
             other = true_map(0.4)
-    told = with_depths_of(own, nowhere(MIDDLE), [(other, measured)], [LEFT, RIGHT], CONFIG)
+    told = with_depths_of(own, nowhere(MIDDLE), [unconfirmed(other, measured, CONFIG)], [LEFT, RIGHT], CONFIG)
     assert torch.equal(told.inverse_depth, own.inverse_depth)
 
 
@@ -89,10 +94,7 @@ def test_of_two_places_the_nearer_is_what_is_seen() -> None:
     behind = a_map(RIGHT, 0.93 * truth(2, RIGHT), 0.9)
     alone, beside = (
         with_depths_of(own, nowhere(MIDDLE), others, [LEFT, RIGHT], CONFIG)
-        for others in (
-            [(true_map(), nowhere(LEFT))],
-            [(behind, nowhere(RIGHT)), (true_map(), nowhere(LEFT))],
-        )
+        for others in (of_the_left(), [unconfirmed(behind, nowhere(RIGHT), CONFIG), *of_the_left()])
     )
     step = step_of_one_pixel(MIDDLE, [LEFT, RIGHT], truth(1, MIDDLE).clamp(min=1e-3))
     right = [

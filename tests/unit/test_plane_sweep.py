@@ -177,22 +177,30 @@ def board_and_wall() -> RayCaster:
     return RayCaster(np.array(corners), np.concatenate([faces + 4 * k for k in range(len(bands))]))
 
 
-def seen(camera: Camera, index: int) -> tuple[View, np.ndarray]:
-    """The view, and the depth of the wall where it is seen through the slot."""
+def taken_of(caster: RayCaster, camera: Camera, index: int) -> tuple[View, np.ndarray, np.ndarray]:
+    """The view, the number of the face that each pixel shows, -1 for none, and where; world frame."""
     origins, directions = camera_rays(camera)
-    hits, shape = board_and_wall().cast(origins, directions), (camera.height, camera.width)
-    image, depth = np.zeros((len(origins), 3), np.float32), np.full(len(origins), np.nan)
-    points = origins[hits.hit] + hits.distance[hits.hit, None] * directions[hits.hit]
-    image[hits.hit] = texture_srgb(points)
-    on_wall = hits.face >= 4
-    through = origins[on_wall] + hits.distance[on_wall, None] * directions[on_wall]
-    x, z = np.abs(through - CENTRE)[:, [0, 2]].T
-    within = (z < 0.5 * SIZE) & (x < 0.35 * SIZE)
-    along = (through - camera.position) @ camera.camera_from_world[2, :3] / OBJECT_UNIT
-    depth[on_wall] = np.where(within, along, np.nan)
+    hits, shape = caster.cast(origins, directions), (camera.height, camera.width)
+    image, places = np.zeros((len(origins), 3), np.float32), np.full((len(origins), 3), np.nan)
+    places[hits.hit] = origins[hits.hit] + hits.distance[hits.hit, None] * directions[hits.hit]
+    image[hits.hit] = texture_srgb(places[hits.hit])
     mask = hits.hit.reshape(shape).astype(np.float32)
     view = View(name=f"{index}.png", camera=camera, image_srgb=image.reshape(*shape, 3), mask=mask)
-    return view, depth.reshape(shape)
+    return view, np.where(hits.hit, hits.face, -1).reshape(shape), places.reshape(*shape, 3)
+
+
+def depth_of(camera: Camera, places: np.ndarray, wanted: np.ndarray) -> np.ndarray:
+    """Along the camera's axis, object units, where it is wanted; else not a number."""
+    along = (places - camera.position) @ camera.camera_from_world[2, :3] / OBJECT_UNIT
+    return np.where(wanted, along, np.nan)
+
+
+def seen(camera: Camera, index: int) -> tuple[View, np.ndarray]:
+    """The view, and the depth of the wall where it is seen through the slot."""
+    view, face, places = taken_of(board_and_wall(), camera, index)
+    x, _, z = np.moveaxis(np.abs(places - CENTRE), -1, 0)
+    through = (face >= 4) & (z < 0.5 * SIZE) & (x < 0.35 * SIZE)
+    return view, depth_of(camera, places, through)
 
 
 def matched(views: tuple[View, ...], config: StereoConfig) -> StereoResult:
@@ -248,16 +256,8 @@ def board_and_side() -> RayCaster:
 
 def seen_side(camera: Camera, index: int) -> tuple[View, np.ndarray]:
     """The view, and the depth of the face that turns away."""
-    origins, directions = camera_rays(camera)
-    hits, shape = board_and_side().cast(origins, directions), (camera.height, camera.width)
-    image, depth = np.zeros((len(origins), 3), np.float32), np.full(len(origins), np.nan)
-    points = origins[hits.hit] + hits.distance[hits.hit, None] * directions[hits.hit]
-    image[hits.hit] = texture_srgb(points)
-    along = (points - camera.position) @ camera.camera_from_world[2, :3] / OBJECT_UNIT
-    depth[hits.hit] = np.where(hits.face[hits.hit] >= 2, along, np.nan)
-    mask = hits.hit.reshape(shape).astype(np.float32)
-    view = View(name=f"{index}.png", camera=camera, image_srgb=image.reshape(*shape, 3), mask=mask)
-    return view, depth.reshape(shape)
+    view, face, places = taken_of(board_and_side(), camera, index)
+    return view, depth_of(camera, places, face >= 2)
 
 
 def test_a_face_that_turns_away_past_a_crease_is_measured() -> None:
