@@ -34,6 +34,7 @@ from backend.stages.surface import ShowSurface, Surface, show_nothing
 from tests.synthetic_scene import (
     CENTRE,
     Scene,
+    camera_at,
     diagonal,
     photographed,
     ring_cameras,
@@ -68,13 +69,17 @@ BOTH = [pytest.param(NEUS, id="neus"), pytest.param(SPARSECRAFT, id="sparsecraft
 
 @cache
 def scene() -> Scene:
-    return photographed(ring_cameras(6, 80))
+    """From all around, and from below."""
+    return photographed([*ring_cameras(6, 80), camera_at(0.0, -4.0, 80)])
 
 
 @cache
 def exact_stereo() -> StereoResult:
-    """Points on the true surface, without depth maps."""
+    """Points on the true surface, each of the view that it faces most, without depth maps."""
     world = np.asarray(true_mesh().vertices)[::20]
+    eyes = np.stack([view.camera.position for view in scene().views]) - world[:, None]
+    facing = (eyes / np.linalg.norm(eyes, axis=-1, keepdims=True) @ true_normals(world)[..., None])[..., 0]
+    assert facing.max(axis=1).min() > 0
     shape = scene().coverage[0].shape
     blank = np.zeros(shape, np.float32)
     points = SurfacePoints(
@@ -83,7 +88,7 @@ def exact_stereo() -> StereoResult:
         colours_srgb=texture_srgb(world).astype(np.float32),
         confidence=np.ones(len(world), np.float32),
         num_views=np.full(len(world), 2),
-        view_index=np.zeros(len(world), np.int64),
+        view_index=facing.argmax(axis=1),
     )
     maps = (DepthMap(depth=blank, confidence=blank, empty=None, subject=None),) * len(scene().views)
     return StereoResult(points=points, depth_maps=maps)
