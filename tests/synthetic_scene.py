@@ -17,7 +17,7 @@ from jaxtyping import Bool, Float32, Float64, Int64
 from PIL import Image
 
 from backend.maths.raycast import RayCaster, camera_rays
-from backend.scene import Camera, Lens, Region, SolvedCameras, View
+from backend.scene import Camera, Lens, Region, SolvedCameras, SurfacePoints, View, transform_points
 
 CENTRE = np.array([0.7, -0.4, 1.1])
 SIZE = 2.5
@@ -152,6 +152,24 @@ def true_region() -> Region:
     object_from_world[:3, :3] /= OBJECT_UNIT
     object_from_world[:3, 3] = -CENTRE / OBJECT_UNIT
     return Region(object_from_world=object_from_world)
+
+
+def faced_points(cameras: list[Camera]) -> SurfacePoints:
+    """Of the true surface, each of the camera it faces most, without those that face none; object frame."""
+    world = np.asarray(true_mesh().vertices)[::20]
+    normals = true_normals(world)
+    towards = np.stack([camera.position for camera in cameras]) - world[:, None]
+    facing = (towards / np.linalg.norm(towards, axis=-1, keepdims=True) @ normals[..., None])[..., 0]
+    faced = facing.max(axis=1) > 0
+    count = int(faced.sum())
+    return SurfacePoints(
+        positions=transform_points(true_region().object_from_world, world[faced]).astype(np.float32),
+        normals=normals[faced].astype(np.float32),
+        colours_srgb=texture_srgb(world[faced]).astype(np.float32),
+        confidence=np.ones(count, np.float32),
+        num_views=np.full(count, 2),
+        view_index=facing[faced].argmax(axis=1),
+    )
 
 
 def camera_at(azimuth_deg: float, height: float, width: int) -> Camera:

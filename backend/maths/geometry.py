@@ -38,23 +38,13 @@ class Pinhole:
     def scaled(self, width: int, height: int) -> "Pinhole":
         """The same camera over an image of another size."""
         scale = self.intrinsics.new_tensor([[width / self.width], [height / self.height], [1.0]])
-        return Pinhole(
-            intrinsics=self.intrinsics * scale,
-            camera_from_object=self.camera_from_object,
-            width=width,
-            height=height,
-        )
+        return replace(self, intrinsics=self.intrinsics * scale, width=width, height=height)
 
     def cropped(self, left: int, top: int, width: int, height: int) -> "Pinhole":
         """The same camera over a window of its image."""
         shift = torch.zeros_like(self.intrinsics)
         shift[0, 2], shift[1, 2] = left, top
-        return Pinhole(
-            intrinsics=self.intrinsics - shift,
-            camera_from_object=self.camera_from_object,
-            width=width,
-            height=height,
-        )
+        return replace(self, intrinsics=self.intrinsics - shift, width=width, height=height)
 
 
 def pinhole_in_object(camera: Camera, region: Region, device: torch.device) -> Pinhole:

@@ -4,12 +4,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float32, Float64, Shaped
+from jaxtyping import Float, Float32, Float64, Int64, Shaped
 from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 
 from ..maths.geometry import Pinhole, pinhole_in_object
-from ..scene import Region, StereoResult, SurfacePoints, View
+from ..scene import Region, StereoResult, View
 
 SURE = 0.3
 """Confidence of a depth that carves, or that opens a scene at the pictures' edges.
@@ -58,6 +58,10 @@ def measurements(
     empty = [None if m.empty is None else ~m.empty for m in stereo.depth_maps]
     subject = [_outline_or_none(m.subject, device) for m in stereo.depth_maps]
     cameras = [pinhole_in_object(view.camera, region, device) for view in views]
+    positions, normals, view_index = (
+        torch.tensor(values, device=device)
+        for values in (points.positions, points.normals, points.view_index)
+    )
     return Measurements(
         cameras=cameras,
         images=[torch.tensor(view.image_srgb, device=device).permute(2, 0, 1) for view in views],
@@ -67,8 +71,8 @@ def measurements(
         outlines=outlines,
         depths=[torch.tensor(map_.depth, device=device) for map_ in stereo.depth_maps],
         confidences=[torch.tensor(map_.confidence, device=device) for map_ in stereo.depth_maps],
-        positions=torch.tensor(points.positions, device=device),
-        normals=_towards_their_views(points, cameras),
+        positions=positions,
+        normals=_towards_their_views(normals, positions, cameras, view_index),
         colours=torch.tensor(points.colours_srgb, device=device),
         confidence=torch.tensor(points.confidence, device=device),
         region_centre=torch.zeros(3, device=device),
@@ -99,17 +103,18 @@ def carried(
     )
 
 
-def _towards_their_views(points: SurfacePoints, cameras: list[Pinhole]) -> Float[Tensor, "points 3"]:
+def _towards_their_views(
+    normals: Float[Tensor, "points 3"],
+    positions: Float[Tensor, "points 3"],
+    cameras: list[Pinhole],
+    view_index: Int64[Tensor, "points"],
+) -> Float[Tensor, "points 3"]:
     """Normals on the side of the view that measured the point, for what it shows is an outside.
 
     Without that, normals of which half are turned round tear the surface, the more the more there are.
     """
-    device = cameras[0].position.device
-    normals = torch.tensor(points.normals, device=device)
-    eyes = torch.stack([camera.position for camera in cameras])[
-        torch.tensor(points.view_index, device=device)
-    ]
-    inwards = ((eyes - torch.tensor(points.positions, device=device)) * normals).sum(dim=-1) < 0
+    eyes = torch.stack([camera.position for camera in cameras])[view_index]
+    inwards = ((eyes - positions) * normals).sum(dim=-1) < 0
     return torch.where(inwards[:, None], -normals, normals)
 
 

@@ -19,20 +19,6 @@ _MOST_OF_EDGE = 0.5
 """Of a picture's edge that may show the subject: more is a mask of what is around it."""
 
 
-def check_pictures(views: tuple[View, ...]) -> None:
-    """Raises ReconstructionError(PHOTO_UNREADABLE) for values that are not numbers.
-
-    They spoil what they are compared with, and the colours.
-    """
-    for view in views:
-        if not np.isfinite(view.image_srgb).all():
-            raise ReconstructionError(
-                ErrorCode.PHOTO_UNREADABLE,
-                f"The photograph {view.name} has pixels whose values are not numbers.",
-                "Export it again, as JPEG, PNG or 16-bit TIFF.",
-            )
-
-
 def check_enough(points: SurfacePoints, views: tuple[View, ...]) -> None:
     """Raises ReconstructionError(NO_SURFACE) where neither points nor outlines tell the shape."""
     told = sum(map(_shows_outline, views)) >= FEWEST_OUTLINES

@@ -17,13 +17,14 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from ..errors import ErrorCode, ReconstructionError
 from ..maths.backdrop import find_backdrop
 from ..maths.geometry import pinhole_in_object, pixel_centres, sample_image, unproject
 from ..maths.inverse_depth import fit_planes, normals_from_planes
 from ..maths.texture import leverage
 from ..scene import DepthMap, Progress, Region, StereoResult, SurfacePoints, View, within
 from .depth_maps import Measured, depth_maps
-from .outlines_alone import FEWEST_POINTS, check_enough, check_pictures, no_points, outlines_alone
+from .outlines_alone import FEWEST_POINTS, check_enough, no_points, outlines_alone
 from .stereo_config import StereoConfig
 from .stereo_windows import neighbours, pyramid, sees_region
 from .strays import without_strays
@@ -38,7 +39,7 @@ def match_views(
     mask; with masks there are no points then, and a decision says so. Raises PHOTO_UNREADABLE if one has
     values that are not numbers.
     """
-    check_pictures(views)
+    _check_pictures(views)
     with torch.no_grad():
         pyramids = [pyramid(view, region, config, device) for view in views]
         nearby = neighbours([sizes[0].camera for sizes in pyramids], config.num_sources)
@@ -50,6 +51,20 @@ def match_views(
     if len(points.positions) < FEWEST_POINTS:
         return outlines_alone(found)
     return replace(found, points=without_strays(points))
+
+
+def _check_pictures(views: tuple[View, ...]) -> None:
+    """Raises ReconstructionError(PHOTO_UNREADABLE) for values that are not numbers.
+
+    They spoil what they are compared with, and the colours.
+    """
+    for view in views:
+        if not np.isfinite(view.image_srgb).all():
+            raise ReconstructionError(
+                ErrorCode.PHOTO_UNREADABLE,
+                f"The photograph {view.name} has pixels whose values are not numbers.",
+                "Export it again, as JPEG, PNG or 16-bit TIFF.",
+            )
 
 
 def unmatched(views: tuple[View, ...]) -> StereoResult:

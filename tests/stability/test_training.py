@@ -88,8 +88,12 @@ def spoiled(rows: slice, columns: slice) -> tuple[View, ...]:
     return (replace(first, image_srgb=image), *others)
 
 
+def movement(field: Refined) -> Tensor:
+    return field.distance - torch.from_numpy(linear().distance)
+
+
 def moved(field: Refined) -> float:
-    return float((field.distance - torch.from_numpy(linear().distance)).abs().max())
+    return float(movement(field).abs().max())
 
 
 def told(surface: Surface) -> Decision:
@@ -245,7 +249,7 @@ def test_a_few_pixels_that_are_no_numbers_cost_a_few_steps() -> None:
     assert with_it.steps == 40
     assert 0 < with_it.taken_back < PATIENCE
     assert with_it.distance.isfinite().all()
-    learnt, all_of_it = (field.distance - torch.from_numpy(linear().distance) for field in (with_it, without))
+    learnt, all_of_it = movement(with_it), movement(without)
     # of two seeds' steps, without such a pixel, 0.70 to 0.87 have one direction
     assert (learnt * all_of_it).sum() > 0.7 * all_of_it.square().sum(), "ten steps before is kept"
     because = told(fitted(one_pixel, 40)).because

@@ -17,10 +17,8 @@ from backend.scene import (
     DepthMap,
     Progress,
     StereoResult,
-    SurfacePoints,
     View,
     no_progress,
-    transform_points,
 )
 from backend.stages import field_surface, neus_fit, render_fit
 from backend.stages.field import SurfaceField
@@ -36,12 +34,11 @@ from tests.synthetic_scene import (
     Scene,
     camera_at,
     diagonal,
+    faced_points,
     photographed,
     ring_cameras,
     surface_distance,
-    texture_srgb,
     true_mesh,
-    true_normals,
     true_region,
 )
 
@@ -75,21 +72,10 @@ def scene() -> Scene:
 
 @cache
 def exact_stereo() -> StereoResult:
-    """Points on the true surface, each of the view that it faces most, without depth maps."""
-    world = np.asarray(true_mesh().vertices)[::20]
-    eyes = np.stack([view.camera.position for view in scene().views]) - world[:, None]
-    facing = (eyes / np.linalg.norm(eyes, axis=-1, keepdims=True) @ true_normals(world)[..., None])[..., 0]
-    assert facing.max(axis=1).min() > 0
-    shape = scene().coverage[0].shape
-    blank = np.zeros(shape, np.float32)
-    points = SurfacePoints(
-        positions=transform_points(true_region().object_from_world, world).astype(np.float32),
-        normals=true_normals(world).astype(np.float32),
-        colours_srgb=texture_srgb(world).astype(np.float32),
-        confidence=np.ones(len(world), np.float32),
-        num_views=np.full(len(world), 2),
-        view_index=facing.argmax(axis=1),
-    )
+    """Points on the true surface, all of which some view shows, without depth maps."""
+    points = faced_points(scene().cameras)
+    assert len(points.positions) == len(true_mesh().vertices[::20])
+    blank = np.zeros(scene().coverage[0].shape, np.float32)
     maps = (DepthMap(depth=blank, confidence=blank, empty=None, subject=None),) * len(scene().views)
     return StereoResult(points=points, depth_maps=maps)
 
