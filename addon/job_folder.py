@@ -12,7 +12,10 @@
 A job never writes outside its folder, and a name that a backend gives is only taken if it lies inside.
 """
 
+import os
 import re
+from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -159,20 +162,23 @@ def has_report(folder: Path) -> bool:
     return (results_in(folder) / REPORT_PAGE).is_file()
 
 
-def past_jobs(parent: Path) -> tuple[PastJob, ...]:
-    """The jobs with a mesh in a folder, the newest first; folders that are no such jobs are left out."""
-    found: list[tuple[float, PastJob]] = []
+def past_jobs(parent: Path) -> Iterator[PastJob]:
+    """The jobs with a mesh in a folder, the newest first; folders that are no such jobs are left out.
+
+    Each is read when it is asked for: the panel asks for few, and is drawn again and again.
+    """
+    made: list[tuple[float, Path]] = []
     try:
-        entries = list(parent.iterdir())
+        with os.scandir(parent) as entries:
+            folders = [Path(entry.path) for entry in entries if entry.is_dir()]
     except OSError:
-        return ()
-    for entry in entries:
-        try:
-            job = read_job(entry)
-            found.append(((job.result / MESH).stat().st_mtime, job))
-        except (FolderError, OSError):
-            continue
-    return tuple(job for _, job in sorted(found, key=lambda item: item[0], reverse=True))
+        return
+    for folder in folders:
+        with suppress(OSError):
+            made.append(((results_in(folder) / MESH).stat().st_mtime, folder))
+    for _, folder in sorted(made, reverse=True):
+        with suppress(FolderError, OSError):
+            yield read_job(folder)
 
 
 def inside(folder: Path, path: Path) -> Path:

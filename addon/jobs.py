@@ -21,6 +21,7 @@ from ..backend.errors import ErrorCode
 from ..backend.wire.client import WireProcess
 from ..backend.wire.protocol import (
     CANCELLED,
+    CRASHED,
     Checked,
     Failed,
     Finished,
@@ -345,6 +346,9 @@ def _take_in(job: RunningJob, message: Message) -> None:
         case Finished():
             job.finished = True
             job.pending = _finishing(job, message)
+        case Failed(code=code) if code == CRASHED and job.cancelling:
+            # it did not answer, and was made to end; a crash of its own would be no news to who stops it
+            _end(job, Failed(code=CANCELLED, text="It was stopped, by force.", remedy="Start it again."))
         case Failed():
             _end(job, message)
 

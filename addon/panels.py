@@ -1,5 +1,6 @@
 """The sidebar: five steps, each with its state in one line and at most one main button."""
 
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -284,7 +285,7 @@ class FEWVIEW_PT_past_jobs(_Panel, bpy.types.Panel):
 
     def draw(self, context: bpy.types.Context) -> None:
         """Each with a button that brings it into the scene, and one for a result from anywhere."""
-        found = past_jobs(jobs_parent(context))[:_MOST_PAST_JOBS]
+        found = list(islice(past_jobs(jobs_parent(context)), _MOST_PAST_JOBS))
         for job in found:
             shown = self.layout.operator("fewview.import_result", text=job.words, icon="IMPORT")
             shown.folder = str(job.folder)

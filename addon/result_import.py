@@ -1,6 +1,7 @@
 """The result of a job on disk in the scene: its mesh, and the cameras and points it was made from."""
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
+from contextlib import suppress
 from pathlib import Path
 
 import bpy
@@ -118,13 +119,21 @@ def _settle(scene: bpy.types.Scene, job: PastJob) -> None:
 def _are_there(scene: bpy.types.Scene, solved: SolvedScene) -> bool:
     """Whether the user has a camera wherever a known one stands, as after a render of generated views."""
     own = [made for made in scene.objects if made.type == "CAMERA" and ROLE not in made]
-    if solved.estimated or not own:
+    poses = [] if solved.estimated else [*_poses(own)]
+    if not poses:
         return False
-    stand = np.array([camera_lens.world_from_camera(camera) for camera in own])
+    stand = np.array(poses)
     size = float(np.ptp(stand[:, :3, 3], axis=0).max()) or 1.0
     off = np.abs(stand[None] - solved.poses[:, None])
     off[..., :3, 3] /= size
     return bool((off.max(axis=(-2, -1)).min(axis=1) < _SAME_PLACE).all())
+
+
+def _poses(cameras: Iterable[bpy.types.Object]) -> Iterator[NDArray[np.float64]]:
+    """`world_from_camera` (4, 4) of those that have one: a mirrored or sheared camera is none of a job's."""
+    for camera in cameras:
+        with suppress(ValueError):
+            yield camera_lens.world_from_camera(camera)
 
 
 def _cameras_or_none(job: PastJob) -> CameraImport | None:

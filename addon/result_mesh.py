@@ -92,6 +92,9 @@ def export(context: bpy.types.Context, result: bpy.types.Object, path: Path) -> 
     write = writers.get(path.suffix.lower())
     if write is None:
         raise ValueError(f"{path.suffix or path.name} is no format for a result: use {', '.join(FORMATS)}")
+    materials = path.with_suffix(".mtl")
+    if path.suffix.lower() == ".obj" and materials.exists() and not path.exists():
+        raise ValueError(f"{materials} exists, of something else, and would be replaced: choose another name")
     with _selected_alone(context, result):
         try:
             write(str(path))

@@ -176,7 +176,8 @@ class Workspace:
         self.remove_previews()
         shutil.rmtree(self.private / _SFM, ignore_errors=True)
         for path in self.private.glob("*.npz"):
-            path.unlink()
+            with suppress(OSError):  # the results are there: what Windows will not let go does no harm
+                when_let_go(path.unlink)
 
     def discard_if_nothing_done(self) -> None:
         """Remove what opening made, where no stage was finished and nothing else is there."""

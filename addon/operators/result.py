@@ -72,12 +72,12 @@ class FEWVIEW_OT_import_result(bpy.types.Operator):
         if chosen:
             return Path(bpy.path.abspath(chosen)).absolute()
         parent = jobs_parent(context)
-        found = past_jobs(parent)
-        if not found:
+        newest = next(past_jobs(parent), None)
+        if newest is None:
             raise FolderError(
                 f"There is no finished job in {parent}: reconstruct first, or choose its folder"
             )
-        return found[0].folder
+        return newest.folder
 
 
 class _Show(OnResult):

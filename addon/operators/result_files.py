@@ -1,5 +1,6 @@
 """Step 5: the mesh as a file for other programs, and what else lies in a job's folder."""
 
+import os
 from pathlib import Path
 
 import bpy
@@ -59,6 +60,14 @@ class FEWVIEW_OT_export(OnResult, bpy.types.Operator):
         context.window_manager.fileselect_add(self)
         return {"RUNNING_MODAL"}
 
+    def check(self, context: bpy.types.Context) -> bool:
+        """In the file browser: the whole name, else it cannot warn of a file that exists."""
+        name = os.path.basename(self.filepath)
+        if not name or Path(name).suffix:
+            return False
+        self.filepath += self.format
+        return True
+
     def execute(self, context: bpy.types.Context) -> Status:
         path = Path(bpy.path.abspath(self.filepath)).absolute()
         if not path.suffix:
@@ -92,10 +101,10 @@ class _OnFolder:
         result = result_or_none(context)
         if result is not None and result.get(JOB):
             return read_job(Path(str(result[JOB]))).folder
-        found = past_jobs(jobs_parent(context))
-        if not found:
+        newest = next(past_jobs(jobs_parent(context)), None)
+        if newest is None:
             raise FolderError(RECONSTRUCT_FIRST)
-        return found[0].folder
+        return newest.folder
 
 
 class FEWVIEW_OT_open_report(_OnFolder, bpy.types.Operator):

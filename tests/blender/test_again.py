@@ -222,7 +222,7 @@ def test_past_jobs_are_of_every_kind(part: Part, tmp_path: Path) -> None:
     rehearsed(part, tmp_path / "somebody", left_out=("report.json",))
     for age, folder in enumerate(made):
         os.utime(folders.results_in(folder) / "mesh.ply", (2e9 - age, 2e9 - age))
-    found = folders.past_jobs(tmp_path)
+    found = list(folders.past_jobs(tmp_path))
     assert [job.folder for job in found] == made
     assert [job.words for job in found] == [
         "RESULT: from the command line",
@@ -232,6 +232,22 @@ def test_past_jobs_are_of_every_kind(part: Part, tmp_path: Path) -> None:
     assert [job.of_points for job in found] == [False, True, False]
     # The inner folder of a job is the job.
     assert folders.read_job(made[2] / "result").folder == made[2]
+
+
+def test_past_jobs_are_read_as_they_are_asked_for(
+    part: Part, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The panel shows few of them, and is drawn ten times a second while a job runs."""
+    folders = part("job_folder")
+    for number in range(4):
+        rehearsed(part, tmp_path / f"RESULT-{number}")
+        (tmp_path / f"{number}.jpg").touch()
+    looked_at: list[Path] = []
+    read_job = folders.read_job
+    monkeypatch.setattr(folders, "read_job", lambda folder: looked_at.append(folder) or read_job(folder))
+    assert next(folders.past_jobs(tmp_path)).folder == looked_at[0]
+    assert len(looked_at) == 1
+    assert len(list(folders.past_jobs(tmp_path))) == 4
 
 
 @pytest.mark.parametrize("earlier_job", [True, False])

@@ -272,6 +272,23 @@ def test_cancel_is_answered_at_once(jobs: ModuleType, tmp_path: Path) -> None:
     assert jobs.ended().cancelled
 
 
+def test_a_program_that_has_to_be_stopped_by_force_was_stopped(
+    addon: ModuleType, jobs: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As in a long call of a library, where no cancel is heard."""
+    client = importlib.import_module(f"{addon.__name__.rpartition('.')[0]}.backend.wire.client")
+    for name, seconds in (("INTERRUPT_AFTER_S", 0.1), ("TERMINATE_AFTER_S", 0.2), ("KILL_AFTER_S", 0.3)):
+        monkeypatch.setattr(client, name, seconds)
+    stage = {"type": "stage", "name": "cameras", "index": 1, "count": 1}
+    command = say(tmp_path, HELLO, stage, then="time.sleep(60)")
+    jobs.start("Testing", command, folder=tmp_path, log_path=tmp_path / "log", on_finished=lambda _: iter(()))
+    tick_until(jobs, lambda: jobs.running().stage == "cameras")
+    jobs.cancel()
+    tick_until(jobs, lambda: jobs.ended() is not None)
+    assert jobs.ended().cancelled
+    assert "force" in jobs.ended().failure.text
+
+
 def test_another_file_keeps_the_job_off_the_scene(jobs: ModuleType, tmp_path: Path) -> None:
     touched: list[str] = []
 

@@ -32,8 +32,9 @@ TYPES = {"<f8": "double", "<f4": "float", "|u1": "uchar"}
 def parts(addon: ModuleType) -> SimpleNamespace:
     """The add-on's modules under their names."""
     names = ("colours", "mesh_import", "mesh_arrays", "heat_map", "ply", "error_map", "result_import")
-    names = (*names, "result_mesh", "jobs")
-    return SimpleNamespace(**{n: importlib.import_module(f"{addon.__name__}.{n}") for n in names})
+    names = (*names, "result_mesh", "jobs", "operators.result_files")
+    found = {n.rpartition(".")[2]: importlib.import_module(f"{addon.__name__}.{n}") for n in names}
+    return SimpleNamespace(**found)
 
 
 def sphere(subdivisions: int = 4) -> tuple[np.ndarray, np.ndarray]:
@@ -798,6 +799,35 @@ def test_export_overwrites_only_when_asked(result: object, tmp_path: Path) -> No
     result.hide_set(True)
     with pytest.raises(RuntimeError, match="hidden"):
         bpy.ops.fewview.export(filepath=str(tmp_path / "other.ply"))
+
+
+def test_the_file_browser_knows_the_whole_name(parts: SimpleNamespace) -> None:
+    """Else it has nothing to warn of, and the file that is there is replaced."""
+    check = parts.result_files.FEWVIEW_OT_export.check
+    for typed, whole in (("/a.b/mine", "/a.b/mine.ply"), ("/a/mine.obj", "/a/mine.obj"), ("/a.b/", "/a.b/")):
+        asked = SimpleNamespace(filepath=typed, format=".ply")
+        assert check(asked, bpy.context) is (typed != whole)
+        assert asked.filepath == whole
+
+
+def test_export_replaces_no_materials_of_another_thing(result: object, tmp_path: Path) -> None:
+    materials = tmp_path / "vase.mtl"
+    materials.write_text("mine")
+    with pytest.raises(RuntimeError, match=r"vase\.mtl exists"):
+        bpy.ops.fewview.export(filepath=str(tmp_path / "vase.obj"), overwrite=True)
+    assert materials.read_text() == "mine"
+    assert not (tmp_path / "vase.obj").exists()
+    for _ in range(2):  # its own
+        bpy.ops.fewview.export(filepath=str(tmp_path / "other.obj"), overwrite=True)
+
+
+def test_a_mirrored_camera_of_the_users_does_no_harm(make_job: JobMaker) -> None:
+    camera = bpy.data.objects.new("Mirror", bpy.data.cameras.new("Mirror"))
+    bpy.context.scene.collection.objects.link(camera)
+    camera.scale.x = -1
+    bpy.context.view_layer.update()
+    assert bpy.ops.fewview.import_result(folder=str(make_job(estimated=False))) == {"FINISHED"}
+    assert len(bpy.data.cameras) == 4
 
 
 def test_the_report_is_opened(make_job: JobMaker, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -198,6 +198,19 @@ def test_undo_and_redo_while_it_runs(rehearsal: Rehearsal) -> None:
     assert_one_result(folder)
 
 
+def test_undo_after_its_end_brings_no_preview_back(rehearsal: Rehearsal) -> None:
+    rehearsal.start(seconds=2)
+    rehearsal.to_preview()
+    bpy.ops.object.empty_add()
+    bpy.ops.ed.undo_push(message="the user's")
+    assert rehearsal.to_end().failure is None
+    bpy.ops.ed.undo_push(message="the result")  # as in a window
+    bpy.ops.ed.undo()
+    assert with_role("mesh") == with_role("preview") == []
+    bpy.ops.ed.redo()
+    assert len(with_role("mesh")) == 1
+
+
 def test_undo_at_every_step(rehearsal: Rehearsal, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(rehearsal.jobs, "_BUDGET_S", -1.0)  # each tick is one step
     bpy.ops.ed.undo_push(message="before")
@@ -248,6 +261,17 @@ def test_opening_another_file_while_it_runs(rehearsal: Rehearsal) -> None:
     assert any("Past Jobs" in text for text in end.warnings)
     assert not bpy.data.objects
     assert bpy.ops.fewview.import_result(folder=str(folder)) == {"FINISHED"}
+    assert_one_result(folder)
+
+
+def test_a_file_that_cannot_be_opened_leaves_it_alone(rehearsal: Rehearsal, tmp_path: Path) -> None:
+    folder = rehearsal.start(seconds=2)
+    rehearsal.to_preview()
+    with pytest.raises(RuntimeError, match=r"none\.blend"):
+        bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "none.blend"))
+    ended = rehearsal.to_end()
+    assert ended.failure is None
+    assert not any("Another file" in warning for warning in ended.warnings)
     assert_one_result(folder)
 
 
@@ -531,7 +555,7 @@ def test_a_hostile_job_is_refused_and_not_listed(rehearsal: Rehearsal, content: 
         bpy.ops.fewview.import_result(folder=str(folder))
     assert not bpy.data.objects
     assert not bpy.data.meshes
-    assert rehearsal.folders.past_jobs(folder.parent) == ()
+    assert not list(rehearsal.folders.past_jobs(folder.parent))
     bpy.context.scene.fewview.output = str(folder.parent)
     with pytest.raises(RuntimeError, match="no finished job"):
         bpy.ops.fewview.import_result()

@@ -297,6 +297,25 @@ def test_a_result_that_is_open_elsewhere_leaves_all_as_they_were(
         assert not list(workspace.private.glob("*/"))
 
 
+def test_a_checkpoint_that_another_program_holds_does_not_fail_the_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A virus scanner on Windows: the results are written, and nothing else is asked of the run."""
+
+    def refuse(path: Path, missing_ok: bool = False) -> None:
+        raise PermissionError(13, "Permission denied", str(path))
+
+    with open_workspace(tmp_path / "out") as workspace:
+        held = workspace.private / "stereo.npz"
+        held.touch()
+        monkeypatch.setattr(Path, "unlink", refuse)
+        workspace.discard_stages()
+        monkeypatch.undo()
+        assert held.exists()
+        workspace.discard_stages()
+        assert not held.exists()
+
+
 def test_a_checkpoint_that_can_not_be_written_is_told(tmp_path: Path) -> None:
     with open_workspace(tmp_path / "out") as workspace:
         (workspace.private / "photos.npz.part").mkdir()
