@@ -25,7 +25,7 @@ from .intrinsics import Pinhole, aspect_pair, shared_aspect_or_none
 from .job_folder import CAMERAS, SPARSE, results_in
 from .placing import upright_from_solved
 from .ply import PlyMesh, read_ply
-from .scenes import scene_named
+from .scenes import in_scene, scene_named
 from .solved import SolvedCamera, SolvedScene, read_solved
 
 JOB, ROLE, PHOTO, SIZE = "fewview_job", "fewview_role", "fewview_photo", "fewview_size"
@@ -167,7 +167,8 @@ def jobs_of(scene: bpy.types.Scene) -> tuple[str, ...]:
 def remove(scene: bpy.types.Scene, job: str) -> int:
     """Remove what imports of the job have made, and say how many objects that was.
 
-    The root stays while something else, such as the mesh or the user's own objects, hangs on it.
+    The root stays while something else, such as the mesh or the user's own objects, hangs on it, and while
+    there is a region: it says where in the cameras' frame that is.
     """
     cameras = objects_of(scene, job, CAMERA)
     gone = cameras + objects_of(scene, job, POINTS)
@@ -175,7 +176,7 @@ def remove(scene: bpy.types.Scene, job: str) -> int:
     for made in gone:
         remove_object(made)
     root = root_or_none(scene, job)
-    if root is not None and not root.children:
+    if root is not None and not root.children and in_scene(scene, scene.fewview.region) is None:
         remove_object(root)
         num_gone += 1
     collection = _collection_or_none(scene, job)

@@ -10,10 +10,23 @@ import bpy
 import numpy as np
 from numpy.typing import NDArray
 
-from .camera_objects import BAKED, kept_similarity, root_or_none, world_from_solved
-from .job_folder import CAMERAS, JOB_FILE, MESH, RESULT, PastJob, inside, results_in
+from .arguments import absolute
+from .camera_objects import BAKED, JOB, ROLE, ROOT, kept_similarity, root_or_none, world_from_solved
+from .job_folder import (
+    CAMERAS,
+    JOB_FILE,
+    MESH,
+    RESULT,
+    FolderError,
+    PastJob,
+    inside,
+    read_job_file,
+    results_in,
+)
 from .placing import similarity_between
 from .ply import read_ply
+from .properties import FEWVIEW_PG_settings
+from .solved import read_solved
 
 
 def frame_owner(job: PastJob) -> Path:
@@ -41,6 +54,33 @@ def world_from_solved_or_none(
     return None if estimated else np.eye(4)
 
 
+def chosen_job_or_none(settings: FEWVIEW_PG_settings) -> Path | None:
+    """Folder of the job that found, or loaded, the cameras that step 2 is set to; None where none did."""
+    if not settings.cameras_job:
+        return None
+    folder = Path(absolute(settings.cameras_job))
+    known = absolute(settings.cameras_path) if settings.camera_source == "KNOWN" else None
+    try:
+        return folder if read_job_file(folder).cameras == known else None
+    except FolderError:  # the user has moved or removed it
+        return None
+
+
+def world_from_cameras_or_none(scene: bpy.types.Scene, cameras: Path) -> NDArray[np.float64] | None:
+    """(4, 4): where the frame of a file of cameras lies in the scene; None where they were estimated and no
+    root places them.
+
+    Known cameras stand in the world. Of several roots that place the same cameras, the scene's counts.
+    """
+    roots = [made for made in scene.objects if made.get(ROLE) == ROOT and _places(made, cameras)]
+    if roots:
+        return world_from_solved(max(roots, key=lambda root: root == scene.fewview.root))
+    try:
+        return None if read_solved(cameras).estimated else np.eye(4)
+    except ValueError:  # another program's, as a COLMAP model
+        return np.eye(4)
+
+
 def world_from_result(result: bpy.types.Object, folder: Path) -> NDArray[np.float64]:
     """(4, 4): where the frame of a job's files lies in the scene, as its imported mesh is placed now.
 
@@ -51,6 +91,17 @@ def world_from_result(result: bpy.types.Object, folder: Path) -> NDArray[np.floa
     path = inside(folder, results_in(folder) / MESH)
     solved = read_ply(path).positions if path.is_file() else np.empty((0, 3))
     return np.array(result.matrix_world, np.float64) @ _object_from_solved(result, solved)
+
+
+def _places(root: bpy.types.Object, cameras: Path) -> bool:
+    """Whether the root's job found the cameras of the file, or was given them."""
+    folder = Path(str(root.get(JOB, "")))
+    if results_in(folder) / CAMERAS == cameras:
+        return True
+    try:
+        return read_job_file(folder).cameras == str(cameras)
+    except FolderError:
+        return False
 
 
 def _object_from_solved(result: bpy.types.Object, solved: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -7,7 +7,8 @@ import numpy as np
 from mathutils import Matrix
 from numpy.typing import NDArray
 
-from .camera_objects import JOB, POINTS, ROLE, world_from_solved
+from .camera_objects import POINTS, ROLE, objects_of
+from .frames import chosen_job_or_none, world_from_cameras_or_none
 from .job_folder import CAMERAS, inside, results_in
 from .placing import region_in_solved, sphere_around
 from .scenes import in_scene
@@ -26,20 +27,22 @@ def region_or_none(scene: bpy.types.Scene) -> bpy.types.Object | None:
     return in_scene(scene, scene.fewview.region)
 
 
-def region_of(scene: bpy.types.Scene) -> Sphere | None:
-    """The region in the solved frame, as a job wants it; None to have the backend find it.
+def region_of(scene: bpy.types.Scene, cameras: str | None) -> Sphere | None:
+    """The region in the frame of the cameras that a job is given; None to have the backend find it.
 
-    Raises ValueError where the empty has no size or the placement cannot be turned back.
+    Raises ValueError where these have no place in the scene, so that the empty says nothing to a job; where
+    the empty has no size; or the placement cannot be turned back.
     """
     empty = region_or_none(scene)
     if empty is None:
         return None
-    return region_in_solved(world_from_root(scene), np.array(empty.matrix_world), empty.empty_display_size)
-
-
-def world_from_root(scene: bpy.types.Scene) -> NDArray[np.float64]:
-    """(4, 4) similarity `world_from_solved` of the scene; the identity where cameras are known."""
-    return world_from_solved(in_scene(scene, scene.fewview.root))
+    world = None if cameras is None else world_from_cameras_or_none(scene, Path(cameras))
+    if world is None:
+        raise ValueError(
+            "The region needs the cameras of these photographs in the scene: estimate or load them in step 2 "
+            "first, or remove the region"
+        )
+    return region_in_solved(world, np.array(empty.matrix_world), empty.empty_display_size)
 
 
 def place_region(scene: bpy.types.Scene, sphere: Sphere) -> bpy.types.Object:
@@ -91,19 +94,11 @@ def fitted(scene: bpy.types.Scene) -> tuple[Sphere, str]:
     raise ValueError("There is nothing to fit the region to: estimate the cameras first, or choose an object")
 
 
-def _job(scene: bpy.types.Scene) -> str:
-    """Folder of the job that the scene's cameras come from; empty where there is none."""
-    root = in_scene(scene, scene.fewview.root)
-    if root is not None and root.get(JOB):
-        return str(root[JOB])
-    return bpy.path.abspath(scene.fewview.cameras_job) if scene.fewview.cameras_job else ""
-
-
 def _points_or_none(scene: bpy.types.Scene) -> tuple[NDArray[np.float64], NDArray[np.float64] | None] | None:
     """Sparse points (points, 3) in the world and, where they have any, their weights."""
-    found = [made for made in scene.objects if made.get(ROLE) == POINTS and made.type == "MESH"]
-    job = _job(scene)
-    chosen = next((made for made in found if made.get(JOB) == job), found[-1] if found else None)
+    job = chosen_job_or_none(scene.fewview)
+    found = [] if job is None else objects_of(scene, str(job), POINTS)
+    chosen = next((made for made in found if made.type == "MESH"), None)
     if chosen is None:
         return None
     mesh = chosen.data
@@ -121,16 +116,17 @@ def _points_or_none(scene: bpy.types.Scene) -> tuple[NDArray[np.float64], NDArra
 
 def _backend_sphere(scene: bpy.types.Scene) -> Sphere | None:
     """What the backend found with the cameras, in the world."""
-    folder = _job(scene)
-    if not folder:
+    folder = chosen_job_or_none(scene.fewview)
+    if folder is None:
         return None
+    cameras = results_in(folder) / CAMERAS
     try:
-        solved = read_solved(inside(Path(folder), results_in(Path(folder)) / CAMERAS))
-    except ValueError:  # no such job any more: the next best guess
+        solved = read_solved(inside(folder, cameras))
+    except ValueError:  # no such file any more: the next best guess
         return None
-    if solved.region_centre is None or solved.region_radius is None:
+    world = world_from_cameras_or_none(scene, cameras)
+    if world is None or solved.region_centre is None or solved.region_radius is None:
         return None
-    world = world_from_root(scene)
     scale = float(np.cbrt(abs(np.linalg.det(world[:3, :3]))))
     return world[:3, :3] @ np.array(solved.region_centre) + world[:3, 3], solved.region_radius * scale
 

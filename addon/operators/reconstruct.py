@@ -11,7 +11,7 @@ from ...backend.wire.photographs import photographs_in
 from ...backend.wire.protocol import PROTOCOL_VERSION, Finished, Job
 from .. import jobs
 from ..arguments import absolute, argument, fill_in
-from ..frames import world_from_solved_or_none
+from ..frames import chosen_job_or_none, world_from_solved_or_none
 from ..job_folder import (
     CAMERAS,
     LOG,
@@ -54,31 +54,24 @@ def jobs_parent(context: bpy.types.Context, given: str = "") -> Path:
 
 
 def cameras_for(settings: FEWVIEW_PG_settings, images: Sequence[Path]) -> str | None:
-    """The cameras file of the job: given, or found by an earlier job; None to find them now.
+    """The cameras file of the job: given, or that of an earlier job of all these images; None to find them.
 
-    Raises ValueError where there are new photographs, so that the cameras have to be found again, and a
-    region that says where in the old cameras' frame the subject is.
+    Raises ValueError where a file is wanted and none is chosen.
     """
     if settings.camera_source == "KNOWN":
         if not settings.cameras_path:
             raise ValueError("No file with known cameras is chosen: choose one in step 2, or Estimate")
         return absolute(settings.cameras_path)
-    if not settings.cameras_job:
+    folder = chosen_job_or_none(settings)
+    if folder is None:
         return None
-    folder = Path(bpy.path.abspath(settings.cameras_job))
     path = results_in(folder) / CAMERAS
     try:
         read_solved(path)
         looked_at = photographs_of(folder)
     except (ValueError, OSError):
         return None  # the user has moved or removed it: they are found again
-    if {path.absolute() for path in images} <= looked_at:
-        return str(path)
-    if settings.region is None:
-        return None
-    raise ValueError(
-        "The region belongs to cameras without the new photographs: estimate them again in step 2"
-    )
+    return str(path) if {path.absolute() for path in images} <= looked_at else None
 
 
 def photographs_of(folder: Path) -> set[Path]:
@@ -155,7 +148,7 @@ class FEWVIEW_OT_reconstruct(bpy.types.Operator):
         cameras = absolute(self.cameras) if self.cameras else None
         if cameras is None and not self.images:
             cameras = cameras_for(settings, images)
-        centre, radius = self._region(context)
+        centre, radius = self._region(context, cameras)
         return Job(
             protocol=PROTOCOL_VERSION,
             images=tuple(str(path) for path in images),
@@ -171,10 +164,12 @@ class FEWVIEW_OT_reconstruct(bpy.types.Operator):
             keep_stages=False,
         )
 
-    def _region(self, context: bpy.types.Context) -> tuple[tuple[float, ...] | None, float | None]:
+    def _region(
+        self, context: bpy.types.Context, cameras: str | None
+    ) -> tuple[tuple[float, ...] | None, float | None]:
         if self.properties.is_property_set("region"):
             return tuple(self.region[:3]), self.region[3]
-        sphere = None if self.images else region_of(context.scene)
+        sphere = None if self.images else region_of(context.scene, cameras)
         return (None, None) if sphere is None else (tuple(map(float, sphere[0])), float(sphere[1]))
 
 

@@ -211,6 +211,7 @@ def take_views(scene_uid: int, folder: Path) -> Iterator[None]:
     truth = folder / TRUTH
     settings.truth = str(truth) if truth.is_file() else ""
     settings.masks = settings.cameras_job = ""
+    settings.root = None  # the views' cameras stand in the world
     yield
     undo_step.push("Render Views")
 
