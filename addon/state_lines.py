@@ -5,6 +5,7 @@ from pathlib import Path
 
 import bpy
 
+from .frames import chosen_job_or_none
 from .job_folder import CAMERAS, results_in
 from .operators.images import list_problems
 from .properties import FEWVIEW_PG_settings
@@ -80,10 +81,11 @@ def result_state(result: bpy.types.Object | None) -> StepState:
 
 
 def solved_or_none(settings: FEWVIEW_PG_settings) -> SolvedScene | None:
-    """What step 2 found; None where it has not run, or its files are gone."""
-    if not settings.cameras_job:
+    """What step 2 found or loaded; None where it has not run as it is set, or its files are gone."""
+    folder = chosen_job_or_none(settings)
+    if folder is None:
         return None
-    path = results_in(Path(bpy.path.abspath(settings.cameras_job))) / CAMERAS
+    path = results_in(folder) / CAMERAS
     try:
         key = (path, path.stat().st_mtime_ns)
         if key not in _read:

@@ -151,6 +151,9 @@ class Sidebar:
         path = self.folder / "job" / "result" / "cameras.json"
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(json.dumps({"frames": frames, "fewview": ours}))
+        folders = self.part("job_folder")
+        asked = folders.Job(protocol=1, images=("0.png", "1.png"), output="result", until="cameras")
+        folders.write_job(self.folder / "job", asked)
         self.settings.cameras_job = str(self.folder / "job")
         return path
 
@@ -434,6 +437,9 @@ def test_found_cameras_and_who_has_none(sidebar: Sidebar) -> None:
     layout = sidebar.draw_all()["FEWVIEW_PT_cameras"]
     assert sidebar.line("cameras") == ("ERROR", "2 of 3 photographs placed")
     assert {"dark.jpg could not be placed", "too few features"} <= set(layout.texts())
+    sidebar.settings.camera_source = "KNOWN"  # others, which are not loaded
+    sidebar.settings.cameras_path = str(path)
+    assert sidebar.line("cameras") == ("CHECKMARK", "Known")
 
 
 @pytest.mark.parametrize("content", [b"", b"{", b"\xff\xfe", b'{"frames": []}', None])
