@@ -11,14 +11,15 @@ from ..machine import choose_device, peak_memory_bytes, set_up_torch
 from ..maths.metrics import load_truth, surface_error
 from ..pipeline import versions
 from ..presets import Settings
-from ..scene import StereoResult, SurfaceMesh
+from ..scene import StereoResult, SurfaceMesh, View
 from ..stages.report import error_numbers
 from ..stages.surface import Surface
 from ..stages.train import TrainConfig
 from ..workspace import fingerprint
+from .among_surroundings import error_of_subject
 from .held_out import held_out_fit, known_views
 from .measuring import Measurement, Numbers, case_files, flat_errors, measuring_fingerprint
-from .one_by_one import Placed, Seconds, extract, fit, match, place
+from .one_by_one import Seconds, extract, fit, match, place
 from .suites import Case
 from .summary import Column
 from .variants import Variant
@@ -135,7 +136,7 @@ def measure_variant(
         return done(numbers={}, failure=error.text), known
     numbers = {
         **_costs({"stereo": stereo, "train": made, "mesh": mesh}),
-        **_errors(case, folder, mesh.result, placed, settings, seed),
+        **errors_of(case, folder, mesh.result, placed.views, seed, settings.report.error_samples),
     }
     return done(numbers=numbers), known
 
@@ -152,16 +153,17 @@ def _costs(steps: Mapping[str, Step[Any]]) -> dict[str, float | None]:
     return costs
 
 
-def _errors(
-    case: Case, folder: Path, mesh: SurfaceMesh, placed: Placed, settings: Settings, seed: int
+def errors_of(
+    case: Case, folder: Path, mesh: SurfaceMesh, views: Sequence[View], seed: int, num_samples: int
 ) -> Numbers:
-    """As a report has them, by the names that a benchmark gives them."""
+    """As a benchmark measures them, and by the same names."""
     numbers: dict[str, float | None] = {}
     if case.truth is not None:
-        cameras = [view.camera for view in placed.views]
-        truth, num_samples = load_truth(folder / case.truth), settings.report.error_samples
-        error = surface_error(mesh, truth, cameras=cameras, seed=seed, num_samples=num_samples)
-        numbers |= flat_errors(error_numbers(error))
+        truths = [load_truth(folder / name) for name in (case.truth, case.surroundings) if name is not None]
+        measure = surface_error if case.surroundings is None else error_of_subject
+        cameras = [view.camera for view in views]
+        error = measure(mesh, *truths, cameras=cameras, seed=seed, num_samples=num_samples)
+        numbers |= flat_errors({} if error is None else error_numbers(error))
     if case.held_out:
         numbers["held_out_psnr_db"] = held_out_fit(mesh, known_views(case, folder, case.held_out)).psnr_db
     return numbers

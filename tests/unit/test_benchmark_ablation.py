@@ -2,20 +2,23 @@
 
 import json
 import sys
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 
 from backend.benchmark import ablation, variants
-from backend.benchmark.ablation import COLUMNS, inputs_of, is_random, measure_variants
+from backend.benchmark.ablation import COLUMNS, errors_of, inputs_of, is_random, measure_variants
 from backend.benchmark.measuring import Measurement
 from backend.benchmark.one_by_one import place
 from backend.benchmark.suites import CASES, SUITES, Case
 from backend.benchmark.summary import aggregate, table
 from backend.benchmark.variants import VARIANTS, Variant
 from backend.presets import PRESETS, Settings
+from backend.scene import SurfaceMesh
 from backend.stages.photos import PhotosConfig
 from backend.stages.report import ReportConfig, flat_settings
 from backend.stages.train import TrainConfig
@@ -132,6 +135,29 @@ def test_what_a_variant_does_not_change_is_done_once(runs: list[Measurement]) ->
     assert without["train_s"] == few["train_s"]
     assert len({numbers["train_s"] for numbers in (first, again, without)}) == 3
     assert len({numbers["mesh_s"] for numbers in (first, again, without, few)}) == 4
+
+
+def test_surroundings_that_are_true_are_no_error(tmp_path: Path) -> None:
+    """As in the other benchmarks: what is measured is the subject alone."""
+    ball = trimesh.creation.icosphere(3)
+    floor = trimesh.creation.box((6.0, 6.0, 0.2)).subdivide().subdivide().subdivide()
+    floor.apply_translation((0.0, 0.0, -1.6))
+    ball.export(tmp_path / "truth.ply")
+    floor.export(tmp_path / "floor.ply")
+    joined = trimesh.util.concatenate((ball, floor))
+    count = len(joined.vertices)
+    mesh = SurfaceMesh(
+        vertices=np.asarray(joined.vertices),
+        faces=np.asarray(joined.faces, np.int64),
+        normals=np.asarray(joined.vertex_normals, np.float32),
+        colours_srgb=np.zeros((count, 3), np.uint8),
+        support=np.ones(count, np.float32),
+    )
+    case = replace(CASE, held_out=(), surroundings="floor.ply")
+    numbers = errors_of(case, tmp_path, mesh, (), seed=0, num_samples=5000)
+    assert numbers["whole_chamfer_percent"] == pytest.approx(0.8, abs=0.4)  # of 5000 samples beside 5000
+    alone = errors_of(replace(case, surroundings=None), tmp_path, mesh, (), seed=0, num_samples=5000)
+    assert alone["whole_chamfer_percent"] > 5
 
 
 def test_a_run_tells_what_it_cost(runs: list[Measurement]) -> None:
