@@ -156,14 +156,14 @@ def fit_level(
             else:
                 measured = points_near_nodes(scene, config, nodes, shown)
                 bridges = _before_hidden(shown, nodes) & (measured.weight < _HARDLY_MEASURED)
-        target, weight = before, torch.full_like(before, config.prior * (32 / nodes) ** 2)
-        for where, least, strength in (
+        target, weight = _broken(
+            distance,
+            before,
+            config.prior * (32 / nodes) ** 2,
             (free, bound, config.free_space),
             (through, 2 * h, config.seen_through),
             (bridges, _PUSHED_CELLS * h, config.seen_through),
-        ):
-            carved = where & (distance < least)
-            target, weight = torch.where(carved, least, target), torch.where(carved, strength, weight)
+        )
         met_along = inside_along(through_subject, distance, met_along)
         pulled = _FADE * pulled + _pulls(through_subject.chosen(met_along.isinf()), bound)
         rays_near, depths = pulled.reshape(*distance.shape, 2).unbind(-1)
@@ -181,6 +181,23 @@ def fit_level(
         rests = _movement(last, distance) < config.settled * h
         left = left - 1 if not rests else looks if looks < left else 0
     return distance
+
+
+def _broken(
+    distance: Float[Tensor, "nodes nodes nodes"],
+    before: Float[Tensor, "nodes nodes nodes"],
+    prior: float,
+    *bounds: tuple[Bool[Tensor, "nodes nodes nodes"], Float[Tensor, "nodes nodes nodes"] | float, float],
+) -> tuple[Float[Tensor, "nodes nodes nodes"], Float[Tensor, "nodes nodes nodes"]]:
+    """Targets and weights: `before`, and where the field is below a bound (where, least, weight) that one.
+
+    Of several the last counts.
+    """
+    target, weight = before, torch.full_like(before, prior)
+    for where, least, strength in bounds:
+        carved = where & (distance < least)
+        target, weight = torch.where(carved, least, target), torch.where(carved, strength, weight)
+    return target, weight
 
 
 def points_near_nodes(

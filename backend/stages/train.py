@@ -16,7 +16,7 @@ from ..maths.grid import refined, spacing
 from ..scene import Decision, Progress, Region, StereoResult, View, within
 from .deadline import PESSIMISM, Clock, Deadline, GridCost, deadline_after, finest_grid, predicted_s
 from .detail import add_detail
-from .flat_faces import flat_faces, no_faces
+from .flat_faces import FlatFaces, flat_faces, no_faces
 from .inner_outlines import FarSide, decision, far_sides
 from .linear_fit import LinearConfig, fit_level, start
 from .looks import Looks
@@ -69,17 +69,10 @@ def fit_surface(
     deadline = deadline_after(config.budget_s, clock)
     progress(0.0, "finding the extent of the surface")
     with torch.no_grad():
-        scene = measurements(views, region, stereo, device)
-        radius, depth = depth_behind(scene, config.linear)
-        began_s = clock()
-        distance = fit_level(scene, start(scene, radius, COARSEST), radius, config.rounds[0], config.linear)
-        frame_from_object = tight_frame(distance)
-        frame = region.part(frame_from_object)
-        costs = [GridCost(nodes=COARSEST, seconds=clock() - began_s)]
-        scene = carried(scene, views, region, frame_from_object)
-        faces = flat_faces(scene) if config.linear.flat_faces else no_faces(scene)
-        scene = faces.beside(scene)
-        distance = start(scene, radius, config.levels[0])
+        extent = _extent(measurements(views, region, stereo, device), views, region, config, clock)
+        scene = extent.scene
+        distance = start(scene, extent.radius, config.levels[0])
+    costs = [extent.cost]
     total = sum(config.steps) + 10 * (len(config.levels) + 1)  # detail is one more
     done, rendered, taken_back, last = 0, 0, 0, len(config.levels) - 1
     told: list[FarSide] = []
@@ -102,10 +95,18 @@ def fit_surface(
             linear, num_looks = looks.planned(before, _looks_wanted(config, level), is_last=level == last)
             ask = looks.on_grid(num_looks, within(progress, done / total, (done + 10) / total))
             distance = fit_level(
-                scene, before, radius, rounds, linear, far=far, told=looks.told, ask=ask, looks=num_looks
+                scene,
+                before,
+                extent.radius,
+                rounds,
+                linear,
+                far=far,
+                told=looks.told,
+                ask=ask,
+                looks=num_looks,
             )
         done += 10
-        show(Surface(distance=distance.cpu().numpy(), grid_from_world=frame.object_from_world))
+        show(Surface(distance=distance.cpu().numpy(), grid_from_world=extent.frame.object_from_world))
         # looks take as long on any grid, and are left out where time is short
         costs.append(GridCost(nodes=nodes, seconds=clock() - began_s - (looks.seconds - spent_s)))
         if steps:
@@ -119,16 +120,16 @@ def fit_surface(
     with torch.no_grad():
         detailed, of_detail = add_detail(
             scene,
-            torch.cat([torch.from_numpy(stereo.points.view_index).to(device), faces.views]),
+            torch.cat([torch.from_numpy(stereo.points.view_index).to(device), extent.faces.views]),
             distance,
             config.detail,
             config.linear,
             partial(_in_time, costs[-1], config.rounds[-1], deadline),
         )
     made = (
-        *_decisions(scene, frame, config, depth, nodes=len(distance), rendered=rendered),
+        *_decisions(extent, config, nodes=len(distance), rendered=rendered),
         of_detail,
-        faces.decision,
+        extent.faces.decision,
         decision(told),
         *looks.decisions,
         _of_rendering(config, rendered, taken_back),
@@ -137,9 +138,45 @@ def fit_surface(
         made = (*made, _of_budget(config.budget_s, deadline.left_s(), config, costs, rendered))
     return Surface(
         distance=detailed.cpu().numpy(),
-        grid_from_world=frame.object_from_world,
+        grid_from_world=extent.frame.object_from_world,
         reach_cells=spacing(len(distance)) / spacing(len(detailed)),
         decisions=made,
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Extent:
+    """Where the surface lies, by a coarse fit, and what was measured of it."""
+
+    scene: Measurements
+    """In a cube that lies tightly around the surface, flat faces among the points."""
+    frame: Region
+    """That cube's sphere."""
+    radius: float
+    """Of the ball behind what is seen."""
+    depth: Decision
+    """How that was found."""
+    faces: FlatFaces
+    cost: GridCost
+
+
+def _extent(
+    scene: Measurements, views: tuple[View, ...], region: Region, config: TrainConfig, clock: Clock
+) -> _Extent:
+    radius, depth = depth_behind(scene, config.linear)
+    began_s = clock()
+    distance = fit_level(scene, start(scene, radius, COARSEST), radius, config.rounds[0], config.linear)
+    frame_from_object = tight_frame(distance)
+    cost = GridCost(nodes=COARSEST, seconds=clock() - began_s)
+    scene = carried(scene, views, region, frame_from_object)
+    faces = flat_faces(scene) if config.linear.flat_faces else no_faces(scene)
+    return _Extent(
+        scene=faces.beside(scene),
+        frame=region.part(frame_from_object),
+        radius=radius,
+        depth=depth,
+        faces=faces,
+        cost=cost,
     )
 
 
@@ -171,19 +208,11 @@ def _of_budget(
     return Decision(what="budget", choice=choice, because=why)
 
 
-def _decisions(
-    scene: Measurements,
-    frame: Region,
-    config: TrainConfig,
-    depth: Decision,
-    *,
-    nodes: int,
-    rendered: int,
-) -> tuple[Decision, ...]:
+def _decisions(extent: _Extent, config: TrainConfig, *, nodes: int, rendered: int) -> tuple[Decision, ...]:
     """What was modelled and what was left out, with the measurement behind it."""
-    masks = sum(outline is not None for outline in scene.outlines)
-    backdrops = sum(backdrop is not None for backdrop in scene.backdrops)
-    cell = spacing(nodes) * frame.radius_world
+    masks = sum(outline is not None for outline in extent.scene.outlines)
+    backdrops = sum(backdrop is not None for backdrop in extent.scene.backdrops)
+    cell = spacing(nodes) * extent.frame.radius_world
     asked = _who_asked(config, nodes == config.levels[-1] and rendered == sum(config.steps))
     made = [
         Decision(
@@ -196,7 +225,7 @@ def _decisions(
             choice="used" if masks or backdrops else "left out",
             because=f"{masks} photographs have masks, {backdrops} an even backdrop",
         ),
-        depth,
+        extent.depth,
         Decision(what="background", choice="left out", because="rays that miss the subject are not rendered"),
     ]
     return tuple(made)
