@@ -29,7 +29,11 @@ _MILLIMETRES_PER_RESOLUTION_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
 _STRIP_ROWS = 256
 """Rows of output made at a time, so that a large photograph is never held as floats at full size."""
 
-_UNREADABLE = (OSError, SyntaxError, ValueError, EOFError, IndexError, Image.DecompressionBombError)
+_LARGEST_PIXELS = 500_000_000
+"""Of a photograph: a phone's largest have 200 million, shifted sensors' 400."""
+Image.MAX_IMAGE_PIXELS = _LARGEST_PIXELS // 2  # Pillow refuses from twice as many on
+
+_UNREADABLE = (OSError, SyntaxError, ValueError, EOFError, IndexError)
 """What Pillow and tifffile raise for damaged files (UnidentifiedImageError is an OSError)."""
 
 
@@ -156,6 +160,10 @@ def _decoded(path: Path) -> tuple[Shaped[np.ndarray, "height width *channels"], 
         if deep is None:
             _refuse(path, error)
         return deep, None
+    except Image.DecompressionBombError as error:
+        text = f"{path.name} is too large: more than {_LARGEST_PIXELS // 1_000_000} million pixels."
+        remedy = "Save it smaller, or leave it out."
+        raise ReconstructionError(ErrorCode.PHOTO_UNREADABLE, text, remedy) from error
     except _UNREADABLE as error:
         _refuse(path, error)
 

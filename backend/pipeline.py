@@ -35,7 +35,13 @@ from .stages.mesh import extract_mesh
 from .stages.neus_fit import NeusConfig, fit_neus
 from .stages.originals import Original
 from .stages.outlines_alone import hollows_filled
-from .stages.photos import load_photos, match_masks, named_photos, without_masks_text
+from .stages.photos import (
+    load_photos,
+    match_masks,
+    named_photos,
+    unused_masks_text,
+    without_masks_text,
+)
 from .stages.radiance_field import Radiance
 from .stages.radiance_fit import RadianceConfig, fit_radiance
 from .stages.region import find_region
@@ -283,7 +289,7 @@ def _files(job: Job) -> _Files:
     Raises ReconstructionError: NO_PHOTOS, TOO_FEW_PHOTOS, MASK_UNUSABLE, PHOTO_UNREADABLE.
     """
     photos = named_photos(job.images)
-    masks = {} if job.masks is None else match_masks(tuple(photos), job.masks)
+    masks = {} if job.masks is None else match_masks(photos, job.masks)
     return _Files(
         photos=photos,
         photo_contents={name: _content(path) for name, path in photos.items()},
@@ -305,6 +311,8 @@ def _placed(
 ) -> tuple[SolvedCameras, Region]:
     """Where each photograph was taken, and what of the world is to be reconstructed."""
     if text := passed_over_text(passed_over([source for source in job.images if source.is_dir()])):
+        this.warn(text)
+    if not job.masks and (text := unused_masks_text(job.images)):
         this.warn(text)
     photos = this.stage("photos", partial(stages.load_photos, job.images, job.masks, settings.photos))
     # Those of an earlier run are where the folder was then.

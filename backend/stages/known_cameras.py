@@ -14,7 +14,7 @@ from ..errors import ErrorCode, ReconstructionError
 from ..images import same_shape
 from ..mesh_files import SPARSE, MeshFileError, read_sparse
 from ..scene import Camera, Decision, Photo, Unplaced
-from ..wire.photographs import is_named
+from ..wire.photographs import is_named, spelling
 from .lenses import PlacedPhoto, Placement, rigid_matrix, sparse_points, undistorted_view
 from .nerfstudio import Estimate, estimate_or_none, frame_lens, read_frames, world_from_camera
 
@@ -197,11 +197,27 @@ def _points_beside(
 
 def _model(folder: Path) -> pycolmap.Reconstruction:
     try:
-        return pycolmap.Reconstruction(folder)
+        model = pycolmap.Reconstruction(folder)
     except (ValueError, RuntimeError, IndexError) as error:
         raise _unusable(
             f"The COLMAP model in {folder} cannot be read ({error}).", "Export it again."
         ) from error
+    if not (folder / "images.bin").is_file():
+        for image_id, name in _names_in_text(folder / "images.txt").items():
+            model.images[image_id].name = name
+    return model
+
+
+def _names_in_text(path: Path) -> dict[int, str]:
+    """The images' names, by their numbers: of a text model pycolmap reads them only up to the first blank."""
+    lines = map(str.strip, path.read_text(encoding="utf-8", errors="surrogateescape").split("\n"))
+    names = {}
+    for line in lines:
+        if line and not line.startswith("#"):
+            number, *_, name = line.split(maxsplit=9)
+            names[int(number)] = name
+            next(lines, None)  # the image's points, of which there may be none
+    return names
 
 
 def _from_model(photos: Sequence[Photo], folder: Path) -> Placement:
@@ -252,8 +268,8 @@ def _unplaced(
 
 def _likeness(photo_path: str, camera_path: str) -> int:
     """0 for another file; more for the same extension, and more for each folder above that agrees."""
-    photo = PurePosixPath(photo_path.lower())
-    camera = PurePosixPath(camera_path.lower().replace("\\", "/"))
+    photo = PurePosixPath(spelling(photo_path))
+    camera = PurePosixPath(spelling(camera_path).replace("\\", "/"))
     # A camera may be named without extension: then its stem can have dots.
     if photo.stem not in (camera.stem, camera.name):
         return 0

@@ -1,7 +1,7 @@
 """First stage: photographs from files, upright and at working size, each with its mask."""
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,7 +11,15 @@ from jaxtyping import Float32
 from ..errors import ErrorCode, ReconstructionError
 from ..images import DecodedImage, read_image, resized, same_shape
 from ..scene import Photo, Progress
-from ..wire.photographs import KINDS, first_names, names_of, photographs_in
+from ..wire.photographs import (
+    KINDS,
+    first_names,
+    masks_among,
+    names_of,
+    photographs_in,
+    pictures_in,
+    spelling,
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,7 +43,7 @@ def load_photos(
     Raises ReconstructionError: NO_PHOTOS, TOO_FEW_PHOTOS, PHOTO_UNREADABLE, MASK_UNUSABLE.
     """
     files = named_photos(sources)
-    masks = {} if masks_folder is None else match_masks(tuple(files), masks_folder)
+    masks = {} if masks_folder is None else match_masks(files, masks_folder)
     photos = []
     for index, (name, path) in enumerate(files.items()):
         progress(index / len(files), f"Reading {name}")
@@ -50,7 +58,10 @@ def named_photos(sources: Sequence[Path]) -> dict[str, Path]:
 
 
 def find_photos(sources: Sequence[Path]) -> list[Path]:
-    """Image files among the sources, each once, in natural order; of a folder its visible image files."""
+    """Photographs among the sources, each once, in natural order; of a folder its visible image files.
+
+    Masks of the others, as a_mask.png beside a.jpg, are none.
+    """
     found: dict[Path, Path] = {}
     for source in sources:
         if not source.exists():
@@ -59,6 +70,8 @@ def find_photos(sources: Sequence[Path]) -> list[Path]:
             )
         members = photographs_in(source) if source.is_dir() else [source]
         found.update({path.resolve(): path for path in members})
+    masks = masks_among(found.values())
+    found = {place: path for place, path in found.items() if path not in masks}
     if not found:
         places = ", ".join(str(source) for source in sources) or "the list"
         text = f"There are no photographs in {places}."
@@ -81,35 +94,59 @@ def natural_order(name: str) -> tuple[tuple[int, int, str], ...]:
     return tuple((0, int(part), "") if index % 2 else (1, 0, part) for index, part in enumerate(parts))
 
 
-def match_masks(names: Sequence[str], masks_folder: Path) -> dict[str, Path]:
+def match_masks(photos: Mapping[str, Path], masks_folder: Path) -> dict[str, Path]:
     """The mask file of each photograph that has one, by the photograph's name.
 
-    For a.jpg: a.png, a_mask.png, a.jpg.png or a.jpg_mask.png, in any image format and letter case.
+    For a.jpg: a.jpg_mask.png, a.jpg.png, a_mask.png or a.png, in any image format and letter case; the first
+    of these that there is. No photograph is a mask, and no mask that of two photographs.
+    Raises ReconstructionError(MASK_UNUSABLE).
     """
     if not masks_folder.is_dir():
         text = f"There is no folder {masks_folder} with masks."
         raise ReconstructionError(ErrorCode.MASK_UNUSABLE, text, "Check the path.")
-    by_stem = {path.stem.lower(): path for path in sorted(photographs_in(masks_folder))}
-    matched = {}
-    for name in names:
+    places = {path.resolve() for path in photos.values()}
+    others = (path for path in sorted(pictures_in(masks_folder)) if path.resolve() not in places)
+    by_stem = {spelling(path.stem): path for path in others}
+    photo_of: dict[Path, str] = {}
+    for name in photos:
         base = Path(name)
-        stems = [base.stem, f"{base.stem}_mask", base.name, f"{base.name}_mask"]
-        masks = [by_stem[stem.lower()] for stem in stems if stem.lower() in by_stem]
-        if masks:
-            matched[name] = masks[0]
-    if not matched:
+        stems = (f"{base.name}_mask", base.name, f"{base.stem}_mask", base.stem)
+        mask = next((by_stem[spelling(stem)] for stem in stems if spelling(stem) in by_stem), None)
+        if mask in photo_of:
+            text = f"The mask {mask.name} could be that of {photo_of[mask]} or of {name}."
+            remedy = "Give each photograph a name of its own, and its mask the same."
+            raise ReconstructionError(ErrorCode.MASK_UNUSABLE, text, remedy)
+        if mask is not None:
+            photo_of[mask] = name
+    if not photo_of:
         text = f"No mask in {masks_folder} is named like a photograph."
-        remedy = f"Name the mask of {names[0]} {Path(names[0]).stem}.png."
-        raise ReconstructionError(ErrorCode.MASK_UNUSABLE, text, remedy)
-    return matched
+        raise ReconstructionError(ErrorCode.MASK_UNUSABLE, text, _naming_text(next(iter(photos))))
+    return {name: mask for mask, name in photo_of.items()}
 
 
 def without_masks_text(names: Sequence[str]) -> str:
     """What to say of photographs without masks where others have some."""
     return (
         f"There is no mask for {first_names(names)}: their background may stay in the mesh. "
-        f"Name the mask of {names[0]} {Path(names[0]).stem}.png."
+        f"{_naming_text(names[0])}"
     )
+
+
+def unused_masks_text(sources: Sequence[Path]) -> str:
+    """What to say of masks that lie among the photographs where none were asked for; empty without any."""
+    pictures = [path for source in sources for path in (pictures_in(source) if source.is_dir() else [source])]
+    names = sorted({path.name for path in masks_among(pictures)}, key=natural_order)
+    if not names:
+        return ""
+    return (
+        f"By their names these are masks, no photographs, and are not used: {first_names(names)}. "
+        "Name their folder as that of the masks to use them."
+    )
+
+
+def _naming_text(name: str) -> str:
+    # beside the photographs, too, this name makes it a mask
+    return f"Name the mask of {name} {Path(name).stem}_mask.png."
 
 
 def _load_photo(path: Path, name: str, mask_path: Path | None, config: PhotosConfig) -> Photo:

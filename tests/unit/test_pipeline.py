@@ -81,6 +81,14 @@ def up_to_the_cameras(job: Job, listener: Listener | None = None) -> tuple[Photo
     return given[0]
 
 
+def found_and_warned(job: Job) -> tuple[tuple[Photo, ...], list[str]]:
+    """The photographs that cameras would be found for, and what the user was told until then."""
+    warned: list[str] = []
+    listener = Quiet()
+    listener.warned = warned.append  # type: ignore[method-assign]
+    return up_to_the_cameras(job, listener), warned
+
+
 def job_of(images: Path, **changes: Any) -> Job:
     return Job(images=(images,), output=images.parent / "out", device="cpu", **changes)
 
@@ -140,7 +148,18 @@ def test_photographs_without_masks_among_others_with_masks_are_told(photos: Path
     up_to_the_cameras(job_of(photos, masks=masks), listener)
     (text,) = warned
     assert "no mask for 1.png:" in text
-    assert "Name the mask of 1.png 1.png" in text
+    assert "Name the mask of 1.png 1_mask.png" in text
+
+
+def test_masks_among_the_photographs_that_nobody_asked_for_are_told(photos: Path) -> None:
+    Image.new("L", (6, 4), 255).save(photos / "1_mask.png")
+    found, warned = found_and_warned(job_of(photos))
+    assert [photo.name for photo in found] == ["0.png", "1.png", "2.png"]
+    assert all(photo.mask is None for photo in found)
+    (text,) = warned
+    assert "1_mask.png" in text
+    found, _ = found_and_warned(job_of(photos, masks=photos))
+    assert [photo.name for photo in found if photo.mask is not None] == ["1.png"]
 
 
 def test_a_finished_job_is_not_replaced_by_another_shoot(photos: Path, tmp_path: Path) -> None:
