@@ -31,6 +31,7 @@ from .stages.camera_refinement import match_solved, with_refined
 from .stages.camera_report import build_camera_report
 from .stages.cameras import solve_cameras
 from .stages.confirmation import unconfirmed
+from .stages.known_cameras import may_be_unturned
 from .stages.mesh import extract_mesh
 from .stages.neus_fit import NeusConfig, fit_neus
 from .stages.originals import Original
@@ -39,6 +40,7 @@ from .stages.photos import (
     load_photos,
     match_masks,
     named_photos,
+    turned_text,
     unused_masks_text,
     without_masks_text,
 )
@@ -319,6 +321,10 @@ def _placed(
     photos = tuple(replace(photo, path=files.photos[photo.name]) for photo in photos)
     if job.masks and (bare := [photo.name for photo in photos if photo.mask is None]):
         this.warn(without_masks_text(bare))
+    cameras_in_doubt = job.cameras is not None and may_be_unturned(job.cameras)
+    doubtful = [photo for photo in photos if cameras_in_doubt or photo.name in files.mask_contents]
+    if text := turned_text(doubtful):
+        this.warn(text)
     scratch = {"workdir": this.workspace.emptied_sfm_folder(), "seed": job.seed}
     solve = partial(stages.solve_cameras, photos, job.cameras, settings.cameras, **scratch)
     solved = this.stage("cameras", solve)

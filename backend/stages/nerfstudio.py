@@ -58,6 +58,11 @@ def estimate_or_none(path: Path) -> Estimate | None:
     )
 
 
+def is_ours(path: Path) -> bool:
+    """Whether the file is one that `transforms_json` made. Raises ReconstructionError(CAMERAS_UNUSABLE)."""
+    return any("fewview" in frame for frame in read_frames(path))
+
+
 def read_frames(path: Path) -> list[Frame]:
     """The frames of the file. Raises ReconstructionError(CAMERAS_UNUSABLE)."""
     try:

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float32
 
 from ..errors import ErrorCode, ReconstructionError
-from ..images import DecodedImage, read_image, resized, same_shape
+from ..images import DecodedImage, read_image, resized, same_shape, upright
 from ..scene import Photo, Progress
 from ..wire.photographs import (
     KINDS,
@@ -132,6 +132,24 @@ def without_masks_text(names: Sequence[str]) -> str:
     )
 
 
+def turned_text(photos: Sequence[Photo]) -> str:
+    """What to say of photographs with masks or cameras that may be of the files' own pixels.
+
+    Empty where EXIF turns none of them, or only such whose shape tells: those taken on their side.
+    """
+    names = [photo.name for photo in photos if photo.exif_orientation != 1 and _keeps_shape(photo)]
+    if not names:
+        return ""
+    return (
+        f"EXIF asks to turn {first_names(names)}: masks and cameras are taken to be of what is then upright. "
+        "If they are not, save these photographs upright and make masks and cameras of them again."
+    )
+
+
+def _keeps_shape(photo: Photo) -> bool:
+    return photo.exif_orientation < 5 or photo.original_width == photo.original_height
+
+
 def unused_masks_text(sources: Sequence[Path]) -> str:
     """What to say of masks that lie among the photographs where none were asked for; empty without any."""
     pictures = [path for source in sources for path in (pictures_in(source) if source.is_dir() else [source])]
@@ -151,11 +169,10 @@ def _naming_text(name: str) -> str:
 
 def _load_photo(path: Path, name: str, mask_path: Path | None, config: PhotosConfig) -> Photo:
     decoded = read_image(path, config.max_side_px)
-    height, width = decoded.image_srgb.shape[:2]
     if mask_path is None:
         mask = decoded.mask if decoded.mask is None or is_outline(decoded.mask) else None
     else:
-        mask = _load_mask(mask_path, name, width, height)
+        mask = _load_mask(mask_path, name, decoded)
     if mask is not None and mask.max() == 0:
         text = f"The mask of {name} is empty: it leaves nothing of the photograph."
         raise ReconstructionError(ErrorCode.MASK_UNUSABLE, text, "Make the subject white and the rest black.")
@@ -167,6 +184,7 @@ def _load_photo(path: Path, name: str, mask_path: Path | None, config: PhotosCon
         original_width=decoded.original_width,
         original_height=decoded.original_height,
         focal_px=decoded.focal_px,
+        exif_orientation=decoded.exif_orientation,
     )
 
 
@@ -185,19 +203,30 @@ def is_outline(alpha: Float32[np.ndarray, "height width"]) -> bool:
     return bool(frame.mean() < 0.5)
 
 
-def _load_mask(path: Path, photo_name: str, width: int, height: int) -> Float32[np.ndarray, "height width"]:
-    """The mask in a file, scaled to the size of its photograph and to values from 0 to 1."""
+def _load_mask(path: Path, photo_name: str, photo: DecodedImage) -> Float32[np.ndarray, "height width"]:
+    """The mask in a file, scaled to the size of its photograph and to values from 0 to 1.
+
+    One that EXIF does not turn and that fits only the photograph's pixels as stored is turned as they are.
+    """
+    height, width = photo.image_srgb.shape[:2]
     try:
         decoded = read_image(path)
     except ReconstructionError as error:
         raise ReconstructionError(ErrorCode.MASK_UNUSABLE, error.text, error.remedy) from error
-    if not same_shape(decoded.original_width, decoded.original_height, width, height):
+    values = _mask_values(decoded)
+    if decoded.exif_orientation == 1 and not _has_shape(values, width, height):
+        values = upright(values, photo.exif_orientation)
+    if not _has_shape(values, width, height):
         size = f"{decoded.original_width}x{decoded.original_height}"
         text = f"The mask {path.name} ({size}) has another shape than {photo_name} ({width}x{height})."
         raise ReconstructionError(
             ErrorCode.MASK_UNUSABLE, text, "Make masks from the photographs as they are."
         )
-    return resized(_mask_values(decoded), width, height)
+    return resized(values, width, height)
+
+
+def _has_shape(values: Float32[np.ndarray, "_ _"], width: int, height: int) -> bool:
+    return same_shape(values.shape[1], values.shape[0], width, height)
 
 
 def _mask_values(decoded: DecodedImage) -> Float32[np.ndarray, "height width"]:

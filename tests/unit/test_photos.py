@@ -15,6 +15,7 @@ from backend.stages.photos import (
     load_photos,
     match_masks,
     natural_order,
+    turned_text,
     unused_masks_text,
 )
 
@@ -221,3 +222,38 @@ def test_accents_may_be_written_as_a_mac_does(tmp_path: Path) -> None:
     name, mask = (unicodedata.normalize(form, "Fuß für.jpg") for form in ("NFC", "NFD"))
     path = write(tmp_path / mask)
     assert match_masks({name: Path("photos") / name}, tmp_path) == {name: path}
+
+
+def write_turned(path: Path, pixels: np.ndarray, orientation: int) -> None:
+    path.parent.mkdir(exist_ok=True)
+    exif = Image.Exif()
+    exif[ExifTags.Base.Orientation] = orientation
+    Image.fromarray(pixels).save(path, exif=exif)
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+@pytest.mark.parametrize("mask_knows", [True, False])
+def test_masks_are_turned_with_their_photographs(orientation: int, mask_knows: bool, tmp_path: Path) -> None:
+    """Those of the pixels as stored: they say so themselves, or their shape tells."""
+    pixels = np.zeros((30, 40), np.uint8)
+    pixels[4:10, 2:12] = 255
+    for name in ["a.png", "b.png"]:
+        write_turned(tmp_path / "photos" / name, pixels, orientation)
+    write_turned(tmp_path / "masks" / "a.png", pixels, orientation if mask_knows else 1)
+    photo = load([tmp_path / "photos"], tmp_path / "masks")[0]
+    assert photo.mask is not None
+    assert photo.exif_orientation == orientation
+    if mask_knows or orientation == 1 or orientation >= 5:
+        np.testing.assert_array_equal(photo.mask, photo.image_srgb[..., 0])
+    assert ("a.png" in turned_text([photo])) == (orientation in (2, 3, 4))
+
+
+def test_an_upright_mask_stays_so(tmp_path: Path) -> None:
+    pixels = np.zeros((30, 40), np.uint8)
+    pixels[4:10, 2:12] = 255
+    for name in ["a.png", "b.png"]:
+        write_turned(tmp_path / "photos" / name, pixels, 6)
+    write_turned(tmp_path / "masks" / "a.png", np.rot90(pixels, -1), 1)
+    photo = load([tmp_path / "photos"], tmp_path / "masks")[0]
+    assert photo.mask is not None
+    np.testing.assert_array_equal(photo.mask, photo.image_srgb[..., 0])

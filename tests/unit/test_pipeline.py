@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from PIL import Image
+from PIL import ExifTags, Image
 
 from backend import pipeline, workspace
 from backend.errors import Cancelled, ErrorCode, ReconstructionError
@@ -160,6 +160,23 @@ def test_masks_among_the_photographs_that_nobody_asked_for_are_told(photos: Path
     assert "1_mask.png" in text
     found, _ = found_and_warned(job_of(photos, masks=photos))
     assert [photo.name for photo in found if photo.mask is not None] == ["1.png"]
+
+
+@pytest.mark.parametrize(
+    ("given", "told"), [({}, False), ({"masks": "masks"}, True), ({"cameras": "transforms.json"}, True)]
+)
+def test_what_may_not_be_turned_with_its_photograph_is_told(
+    given: dict[str, str], told: bool, photos: Path, tmp_path: Path
+) -> None:
+    """Upside down or not: the shape of a mask or camera does not tell."""
+    exif = Image.Exif()
+    exif[ExifTags.Base.Orientation] = 3
+    Image.new("RGB", (6, 4)).save(photos / "1.png", exif=exif)
+    make_photos(tmp_path / "masks", 5)
+    (tmp_path / "transforms.json").write_text('{"frames": []}')
+    _, warned = found_and_warned(job_of(photos, **{name: tmp_path / path for name, path in given.items()}))
+    assert [text for text in warned if "EXIF asks to turn 1.png:" in text] == warned
+    assert bool(warned) == told
 
 
 def test_a_finished_job_is_not_replaced_by_another_shoot(photos: Path, tmp_path: Path) -> None:
