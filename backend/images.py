@@ -29,7 +29,11 @@ _MILLIMETRES_PER_RESOLUTION_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
 _STRIP_ROWS = 256
 """Rows of output made at a time, so that a large photograph is never held as floats at full size."""
 
-_UNREADABLE = (OSError, SyntaxError, ValueError, EOFError, IndexError, Image.DecompressionBombError)
+_LARGEST_PIXELS = 500_000_000
+"""Of a photograph: a phone's largest have 200 million, shifted sensors' 400."""
+Image.MAX_IMAGE_PIXELS = _LARGEST_PIXELS // 2  # Pillow refuses from twice as many on
+
+_UNREADABLE = (OSError, SyntaxError, ValueError, EOFError, IndexError)
 """What Pillow and tifffile raise for damaged files (UnidentifiedImageError is an OSError)."""
 
 
@@ -45,6 +49,8 @@ class DecodedImage:
     original_height: int
     focal_px: float | None
     """From EXIF, in pixels of the original size; None where there is none."""
+    exif_orientation: int
+    """1 to 8: how the file's own pixels had to be turned; 1 where they stand upright."""
 
 
 def read_image(path: Path, max_side_px: int | None = None) -> DecodedImage:
@@ -54,7 +60,8 @@ def read_image(path: Path, max_side_px: int | None = None) -> DecodedImage:
     a channel (of colour PNG with 16 bits the upper 8 are used).
     Raises ReconstructionError(PHOTO_UNREADABLE).
     """
-    stored, focal_px = _decoded(path)
+    stored, focal_px, exif_orientation = _decoded(path)
+    stored = upright(stored, exif_orientation)
     height, width = stored.shape[:2]
     small_width, small_height = fitted_size(width, height, max_side_px)
     pixels = resized(stored, small_width, small_height)
@@ -66,6 +73,7 @@ def read_image(path: Path, max_side_px: int | None = None) -> DecodedImage:
         original_width=width,
         original_height=height,
         focal_px=focal_px,
+        exif_orientation=exif_orientation,
     )
 
 
@@ -106,7 +114,7 @@ def resized(
 def upright(
     image: Shaped[np.ndarray, "height width *channels"], exif_orientation: int
 ) -> Shaped[np.ndarray, "new_height new_width *channels"]:
-    """The image turned and mirrored as its EXIF orientation (1 to 8) asks; unknown values change nothing."""
+    """The image turned and mirrored as its EXIF orientation (1 to 8) asks."""
     if exif_orientation in (5, 6, 7, 8):
         image = np.swapaxes(image, 0, 1)
     if exif_orientation in (2, 3, 6, 7):
@@ -140,8 +148,8 @@ def focal_px_or_none(exif: Image.Exif, width: int, height: int) -> float | None:
     return focal_mm / unit_mm * density * max(width, height) / saved_longer_px
 
 
-def _decoded(path: Path) -> tuple[Shaped[np.ndarray, "height width *channels"], float | None]:
-    """Pixels as stored, upright, and the focal length in pixels."""
+def _decoded(path: Path) -> tuple[Shaped[np.ndarray, "height width *channels"], float | None, int]:
+    """Pixels as stored, the focal length in pixels, and the EXIF orientation."""
     try:
         register_heif_opener()  # Pillow has none of its own
         # Pillow warns of large and of damaged files; what it cannot read it raises as well.
@@ -150,12 +158,17 @@ def _decoded(path: Path) -> tuple[Shaped[np.ndarray, "height width *channels"], 
             focal_px = focal_px_or_none(exif, *file.size)
             deep = _deep_colour_or_none(path) if file.format == "TIFF" else None
             pixels = np.asarray(_plain_mode(file)) if deep is None else deep
-            return upright(pixels, int(exif.get(ExifTags.Base.Orientation, 1))), focal_px
+            orientation = exif.get(ExifTags.Base.Orientation, 1)
+            return pixels, focal_px, orientation if orientation in range(1, 9) else 1
     except UnidentifiedImageError as error:
         deep = _deep_colour_or_none(path)
         if deep is None:
             _refuse(path, error)
-        return deep, None
+        return deep, None, 1
+    except Image.DecompressionBombError as error:
+        text = f"{path.name} is too large: more than {_LARGEST_PIXELS // 1_000_000} million pixels."
+        remedy = "Save it smaller, or leave it out."
+        raise ReconstructionError(ErrorCode.PHOTO_UNREADABLE, text, remedy) from error
     except _UNREADABLE as error:
         _refuse(path, error)
 

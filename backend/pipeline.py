@@ -31,11 +31,19 @@ from .stages.camera_refinement import match_solved, with_refined
 from .stages.camera_report import build_camera_report
 from .stages.cameras import solve_cameras
 from .stages.confirmation import unconfirmed
+from .stages.known_cameras import may_be_unturned
 from .stages.mesh import extract_mesh
 from .stages.neus_fit import NeusConfig, fit_neus
 from .stages.originals import Original
 from .stages.outlines_alone import hollows_filled
-from .stages.photos import load_photos, match_masks, named_photos, without_masks_text
+from .stages.photos import (
+    load_photos,
+    match_masks,
+    named_photos,
+    turned_text,
+    unused_masks_text,
+    without_masks_text,
+)
 from .stages.radiance_field import Radiance
 from .stages.radiance_fit import RadianceConfig, fit_radiance
 from .stages.region import find_region
@@ -283,7 +291,7 @@ def _files(job: Job) -> _Files:
     Raises ReconstructionError: NO_PHOTOS, TOO_FEW_PHOTOS, MASK_UNUSABLE, PHOTO_UNREADABLE.
     """
     photos = named_photos(job.images)
-    masks = {} if job.masks is None else match_masks(tuple(photos), job.masks)
+    masks = {} if job.masks is None else match_masks(photos, job.masks)
     return _Files(
         photos=photos,
         photo_contents={name: _content(path) for name, path in photos.items()},
@@ -306,11 +314,17 @@ def _placed(
     """Where each photograph was taken, and what of the world is to be reconstructed."""
     if text := passed_over_text(passed_over([source for source in job.images if source.is_dir()])):
         this.warn(text)
+    if not job.masks and (text := unused_masks_text(job.images)):
+        this.warn(text)
     photos = this.stage("photos", partial(stages.load_photos, job.images, job.masks, settings.photos))
     # Those of an earlier run are where the folder was then.
     photos = tuple(replace(photo, path=files.photos[photo.name]) for photo in photos)
     if job.masks and (bare := [photo.name for photo in photos if photo.mask is None]):
         this.warn(without_masks_text(bare))
+    cameras_in_doubt = job.cameras is not None and may_be_unturned(job.cameras)
+    doubtful = [photo for photo in photos if cameras_in_doubt or photo.name in files.mask_contents]
+    if text := turned_text(doubtful):
+        this.warn(text)
     scratch = {"workdir": this.workspace.emptied_sfm_folder(), "seed": job.seed}
     solve = partial(stages.solve_cameras, photos, job.cameras, settings.cameras, **scratch)
     solved = this.stage("cameras", solve)

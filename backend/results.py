@@ -123,4 +123,5 @@ def _json(content: dict[str, object]) -> str:
 
 
 def _text(content: str) -> Callable[[Path], object]:
-    return lambda path: path.write_text(content, encoding="utf-8")
+    # the names of files need not be valid text
+    return lambda path: path.write_text(content, encoding="utf-8", errors="backslashreplace")

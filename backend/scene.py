@@ -51,6 +51,8 @@ class Photo:
     original_height: int
     focal_px: float | None
     """Focal length in pixels of the original size, from EXIF; None where there is none."""
+    exif_orientation: int = 1
+    """1 to 8: how the file's own pixels had to be turned; 1 where they stand upright."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -226,7 +226,7 @@ def _read_job(path: Path) -> protocol.Job:
     """The job of the file; ReconstructionError(SETTINGS_INVALID) where it is none."""
     remedy = "Write the file as backend/wire/protocol.py describes it."
     try:
-        return protocol.decode_job(path.read_text(encoding="utf-8"))
+        return protocol.decode_job(path.read_text(encoding="utf-8-sig"))
     except (OSError, UnicodeDecodeError, protocol.ProtocolError) as error:
         text = f"The job file {path} cannot be used: {error}."
         raise ReconstructionError(ErrorCode.SETTINGS_INVALID, text, remedy) from error
@@ -235,7 +235,7 @@ def _read_job(path: Path) -> protocol.Job:
 @contextmanager
 def _logging_to(path: Path) -> Iterator[None]:
     """Add what is logged to the file, and the trace of what ends the run."""
-    handler = logging.FileHandler(path, encoding="utf-8")
+    handler = logging.FileHandler(path, encoding="utf-8", errors="backslashreplace")
     handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
     root = logging.getLogger()
     root.addHandler(handler)

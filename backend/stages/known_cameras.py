@@ -14,9 +14,10 @@ from ..errors import ErrorCode, ReconstructionError
 from ..images import same_shape
 from ..mesh_files import SPARSE, MeshFileError, read_sparse
 from ..scene import Camera, Decision, Photo, Unplaced
-from ..wire.photographs import is_named
+from ..wire.photographs import first_names, is_named, spelling
 from .lenses import PlacedPhoto, Placement, rigid_matrix, sparse_points, undistorted_view
-from .nerfstudio import Estimate, estimate_or_none, frame_lens, read_frames, world_from_camera
+from .nerfstudio import Estimate, estimate_or_none, frame_lens, is_ours, read_frames, world_from_camera
+from .stored_pixels import is_of_stored_pixels, turned_upright
 
 _ROTATION_TOLERANCE = 5e-3
 """Poses are often written with few digits; nearer than this they are made exact."""
@@ -31,7 +32,9 @@ _CHECK = "Check that the cameras belong to these photographs."
 def read_placement(photos: Sequence[Photo], given: Path) -> Placement:
     """The cameras in a transforms.json, a COLMAP model folder, or a folder that has one of them.
 
-    Cameras and photographs are matched by file name; photographs without a camera are not placed.
+    Cameras and photographs are matched by file name; photographs without a camera are not placed. COLMAP does
+    not look at the EXIF orientation, so cameras of a model are turned with their photographs; those of a
+    transforms.json only where they would not fit else.
     Raises ReconstructionError(CAMERAS_UNUSABLE).
     """
     source = _find_source(given)
@@ -48,6 +51,15 @@ def read_cameras(given: Path) -> tuple[tuple[str, Camera], ...]:
     blanks = _blanks_of_model(source) if source.is_dir() else _blanks_of_transforms(source)
     placed = read_placement(blanks, given).placed
     return tuple((blanks[one.index].name, undistorted_view(blanks[one.index], one).camera) for one in placed)
+
+
+def may_be_unturned(given: Path) -> bool:
+    """Whether cameras that are taken to be of upright photographs may not be.
+
+    Those that others wrote as transforms.json: they may have looked at the EXIF orientation or not.
+    """
+    source = _find_source(given)
+    return source.is_file() and not is_ours(source)
 
 
 def _blanks_of_transforms(path: Path) -> tuple[Photo, ...]:
@@ -149,28 +161,29 @@ def _from_transforms(photos: Sequence[Photo], path: Path) -> Placement:
     estimate = estimate_or_none(path)
     why = _why_unplaced(photos, estimate)
     matched = _matched(photos, [str(frame["file_path"]) for frame in frames], path, left_out=why)
-    placed = []
+    read = []
     for index, number in sorted(matched.items()):
         photo, frame = photos[index], frames[number]
         lens = frame_lens(frame, photo)
         # exact before it is inverted: far from the origin the position keeps its digits, not the rotation's
         pose = checked_pose(world_from_camera(frame, photo.name), photo.name)
-        placed.append(_placed(index, photo, lens, np.linalg.inv(pose)))
+        read.append(PlacedPhoto(index=index, lens=lens, camera_from_world=np.linalg.inv(pose)))
+    placed, decisions = _upright(photos, read, path, as_stored=False)
     columns = [number for _, number in sorted(matched.items())]
     positions, visibility = np.zeros((0, 3)), np.zeros((0, len(placed)), bool)
     if estimate is not None:
         positions, visibility = _points_beside(path, columns, len(frames))
     because = f"{path.name} says that FewView estimated them"
     return Placement(
-        placed=tuple(placed),
+        placed=placed,
         unplaced=_unplaced(photos, matched, path, why),
         sparse_positions=positions,
         sparse_visibility=visibility,
         reprojection_error_px=None if estimate is None else estimate.reprojection_error_px,
         estimated=estimate is not None,
-        decisions=()
+        decisions=decisions
         if estimate is None
-        else (Decision(what="cameras", choice="as found before", because=because),),
+        else (Decision(what="cameras", choice="as found before", because=because), *decisions),
     )
 
 
@@ -197,31 +210,49 @@ def _points_beside(
 
 def _model(folder: Path) -> pycolmap.Reconstruction:
     try:
-        return pycolmap.Reconstruction(folder)
+        model = pycolmap.Reconstruction(folder)
     except (ValueError, RuntimeError, IndexError) as error:
         raise _unusable(
             f"The COLMAP model in {folder} cannot be read ({error}).", "Export it again."
         ) from error
+    if not (folder / "images.bin").is_file():
+        for image_id, name in _names_in_text(folder / "images.txt").items():
+            model.images[image_id].name = name
+    return model
+
+
+def _names_in_text(path: Path) -> dict[int, str]:
+    """The images' names, by their numbers: of a text model pycolmap reads them only up to the first blank."""
+    lines = map(str.strip, path.read_text(encoding="utf-8", errors="surrogateescape").split("\n"))
+    names = {}
+    for line in lines:
+        if line and not line.startswith("#"):
+            number, *_, name = line.split(maxsplit=9)
+            names[int(number)] = name
+            next(lines, None)  # the image's points, of which there may be none
+    return names
 
 
 def _from_model(photos: Sequence[Photo], folder: Path) -> Placement:
     model = _model(folder)
     image_ids = sorted(model.reg_image_ids())
     matched = _matched(photos, [model.images[i].name for i in image_ids], folder)
-    placed, ids = [], []
+    read, ids = [], []
     for index, number in sorted(matched.items()):
         image = model.images[image_ids[number]]
         lens = model.cameras[image.camera_id]
         pose = checked_pose(rigid_matrix(image.cam_from_world()), photos[index].name)
-        placed.append(_placed(index, photos[index], lens, pose))
+        read.append(PlacedPhoto(index=index, lens=lens, camera_from_world=pose))
         ids.append(image_ids[number])
+    placed, decisions = _upright(photos, read, folder, as_stored=True)
     positions, visibility = sparse_points(model, ids)
     return Placement(
-        placed=tuple(placed),
+        placed=placed,
         unplaced=_unplaced(photos, matched, folder),
         sparse_positions=positions,
         sparse_visibility=visibility,
         reprojection_error_px=None,
+        decisions=decisions,
     )
 
 
@@ -252,8 +283,8 @@ def _unplaced(
 
 def _likeness(photo_path: str, camera_path: str) -> int:
     """0 for another file; more for the same extension, and more for each folder above that agrees."""
-    photo = PurePosixPath(photo_path.lower())
-    camera = PurePosixPath(camera_path.lower().replace("\\", "/"))
+    photo = PurePosixPath(spelling(photo_path))
+    camera = PurePosixPath(spelling(camera_path).replace("\\", "/"))
     # A camera may be named without extension: then its stem can have dots.
     if photo.stem not in (camera.stem, camera.name):
         return 0
@@ -265,19 +296,42 @@ def _likeness(photo_path: str, camera_path: str) -> int:
     return likeness
 
 
-def _placed(index: int, photo: Photo, lens: pycolmap.Camera, pose: Float64[np.ndarray, "4 4"]) -> PlacedPhoto:
+def _upright(
+    photos: Sequence[Photo], read: Sequence[PlacedPhoto], source: Path, *, as_stored: bool
+) -> tuple[tuple[PlacedPhoto, ...], tuple[Decision, ...]]:
+    """The cameras that were read, checked, and turned where they are of their file's own pixels.
+
+    as_stored: whether to take them for such where their shape does not tell.
+    """
+    placed, turned = [], []
+    for one in read:
+        photo = photos[one.index]
+        _check_lens(photo, one.lens)
+        if is_of_stored_pixels(photo, one.lens, where_both_fit=as_stored):
+            one = turned_upright(photo, one)
+            turned.append(photo.name)
+        _check_shape(photo, one.lens)
+        placed.append(one)
+    because = f"{source.name} is of pixels as they are stored, and EXIF turns {first_names(turned)}"
+    decision = Decision(what="cameras", choice="turned with their photographs", because=because)
+    return tuple(placed), (decision,) if turned else ()
+
+
+def _check_shape(photo: Photo, lens: pycolmap.Camera) -> None:
     if not same_shape(lens.width, lens.height, photo.original_width, photo.original_height):
         ours = f"{photo.original_width}x{photo.original_height}"
         text = (
             f"The camera of {photo.name} is for {lens.width}x{lens.height} pixels, the photograph has {ours}."
         )
         raise _unusable(text)
+
+
+def _check_lens(photo: Photo, lens: pycolmap.Camera) -> None:
     if not lens.is_perspective():  # asked for its focal length, pycolmap would crash
         text = f"The camera of {photo.name} is a panorama ({lens.model.name}), which cannot be used."
         raise _unusable(text, "Give photographs and cameras of one direction each.")
     if not np.isfinite(lens.params).all() or min(lens.focal_length_x, lens.focal_length_y) <= 0:
         raise _unusable(f"The focal length or distortion of {photo.name} is not finite and positive.")
-    return PlacedPhoto(index=index, lens=lens, camera_from_world=pose)
 
 
 def _unusable(text: str, remedy: str = _CHECK) -> ReconstructionError:

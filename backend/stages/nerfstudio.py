@@ -29,6 +29,9 @@ OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 _PINHOLE_PARAMS = ("fl_x", "fl_y", "cx", "cy")
 _COLMAP_PARAMS = "colmap_params"
 
+_LARGEST_SIDE_PX = 1_000_000
+"""More is a slip of the pen, and soon more than pycolmap can hold."""
+
 Frame = Mapping[str, Any]
 """One frame's entries over those at the top of the file."""
 
@@ -44,7 +47,7 @@ class Estimate:
 
 def estimate_or_none(path: Path) -> Estimate | None:
     """What `transforms_json` left in the file; None where the cameras come from elsewhere, or were given."""
-    ours = json.loads(path.read_text(encoding="utf-8")).get("fewview")
+    ours = json.loads(path.read_text(encoding="utf-8-sig")).get("fewview")
     if not isinstance(ours, dict) or ours.get("estimated") is not True:
         return None
     error_px, unplaced = ours.get("reprojection_error_px"), ours.get("unplaced")
@@ -55,10 +58,15 @@ def estimate_or_none(path: Path) -> Estimate | None:
     )
 
 
+def is_ours(path: Path) -> bool:
+    """Whether the file is one that `transforms_json` made. Raises ReconstructionError(CAMERAS_UNUSABLE)."""
+    return any("fewview" in frame for frame in read_frames(path))
+
+
 def read_frames(path: Path) -> list[Frame]:
     """The frames of the file. Raises ReconstructionError(CAMERAS_UNUSABLE)."""
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+        content = json.loads(path.read_text(encoding="utf-8-sig"))
         shared = {key: value for key, value in content.items() if key != "frames"}
         frames: list[Frame] = [{**shared, **frame} for frame in content["frames"]]
     except (OSError, ValueError, AttributeError, TypeError, KeyError) as error:
@@ -92,6 +100,8 @@ def frame_lens(frame: Frame, photo: Photo) -> pycolmap.Camera:
     """
     width = _number(frame, "w", photo, float(photo.original_width))
     height = _number(frame, "h", photo, float(photo.original_height))
+    if min(width, height) < 1 or max(width, height) > _LARGEST_SIDE_PX:
+        raise _unusable(f"The camera of {photo.name} is for {width:g}x{height:g} pixels.")
     model = str(frame.get("camera_model", "OPENCV")).upper()
     size = {"width": round(width), "height": round(height)}
     if _COLMAP_PARAMS in frame:
@@ -176,15 +186,18 @@ def _colmap_lens(frame: Frame, model: str, photo: Photo, size: dict[str, int]) -
 
 def _focal_lengths(frame: Frame, photo: Photo, width: float, height: float) -> tuple[float, float]:
     """In pixels: fl_x and fl_y, or from the field of view; one of them counts for both."""
-    fx = _number(frame, "fl_x", photo, 0.0)
-    fy = _number(frame, "fl_y", photo, 0.0)
-    if fx == 0 and "camera_angle_x" in frame:
-        fx = width / 2 / math.tan(_number(frame, "camera_angle_x", photo, 0.0) / 2)
-    if fy == 0 and "camera_angle_y" in frame:
-        fy = height / 2 / math.tan(_number(frame, "camera_angle_y", photo, 0.0) / 2)
+    fx = _focal_length(frame, "x", photo, width)
+    fy = _focal_length(frame, "y", photo, height)
     if fx == 0 and fy == 0:
         raise _unusable(f"The camera of {photo.name} has no focal length.", "Add fl_x, or camera_angle_x.")
     return fx or fy, fy or fx
+
+
+def _focal_length(frame: Frame, axis: str, photo: Photo, side_px: float) -> float:
+    """Along one axis, in pixels; 0 where the frame does not tell."""
+    focal = _number(frame, f"fl_{axis}", photo, 0.0)
+    angle = _number(frame, f"camera_angle_{axis}", photo, 0.0)
+    return side_px / 2 / math.tan(angle / 2) if focal == 0 != angle else focal
 
 
 def _number(frame: Frame, key: str, photo: Photo, default: float) -> float:

@@ -1,7 +1,7 @@
 """First stage: photographs from files, upright and at working size, each with its mask."""
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -9,9 +9,17 @@ import numpy as np
 from jaxtyping import Float32
 
 from ..errors import ErrorCode, ReconstructionError
-from ..images import DecodedImage, read_image, resized, same_shape
+from ..images import DecodedImage, read_image, resized, same_shape, upright
 from ..scene import Photo, Progress
-from ..wire.photographs import KINDS, first_names, names_of, photographs_in
+from ..wire.photographs import (
+    KINDS,
+    first_names,
+    masks_among,
+    names_of,
+    photographs_in,
+    pictures_in,
+    spelling,
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,7 +43,7 @@ def load_photos(
     Raises ReconstructionError: NO_PHOTOS, TOO_FEW_PHOTOS, PHOTO_UNREADABLE, MASK_UNUSABLE.
     """
     files = named_photos(sources)
-    masks = {} if masks_folder is None else match_masks(tuple(files), masks_folder)
+    masks = {} if masks_folder is None else match_masks(files, masks_folder)
     photos = []
     for index, (name, path) in enumerate(files.items()):
         progress(index / len(files), f"Reading {name}")
@@ -50,7 +58,10 @@ def named_photos(sources: Sequence[Path]) -> dict[str, Path]:
 
 
 def find_photos(sources: Sequence[Path]) -> list[Path]:
-    """Image files among the sources, each once, in natural order; of a folder its visible image files."""
+    """Photographs among the sources, each once, in natural order; of a folder its visible image files.
+
+    Masks of the others, as a_mask.png beside a.jpg, are none.
+    """
     found: dict[Path, Path] = {}
     for source in sources:
         if not source.exists():
@@ -59,6 +70,8 @@ def find_photos(sources: Sequence[Path]) -> list[Path]:
             )
         members = photographs_in(source) if source.is_dir() else [source]
         found.update({path.resolve(): path for path in members})
+    masks = masks_among(found.values())
+    found = {place: path for place, path in found.items() if path not in masks}
     if not found:
         places = ", ".join(str(source) for source in sources) or "the list"
         text = f"There are no photographs in {places}."
@@ -81,44 +94,85 @@ def natural_order(name: str) -> tuple[tuple[int, int, str], ...]:
     return tuple((0, int(part), "") if index % 2 else (1, 0, part) for index, part in enumerate(parts))
 
 
-def match_masks(names: Sequence[str], masks_folder: Path) -> dict[str, Path]:
+def match_masks(photos: Mapping[str, Path], masks_folder: Path) -> dict[str, Path]:
     """The mask file of each photograph that has one, by the photograph's name.
 
-    For a.jpg: a.png, a_mask.png, a.jpg.png or a.jpg_mask.png, in any image format and letter case.
+    For a.jpg: a.jpg_mask.png, a.jpg.png, a_mask.png or a.png, in any image format and letter case; the first
+    of these that there is. No photograph is a mask, and no mask that of two photographs.
+    Raises ReconstructionError(MASK_UNUSABLE).
     """
     if not masks_folder.is_dir():
         text = f"There is no folder {masks_folder} with masks."
         raise ReconstructionError(ErrorCode.MASK_UNUSABLE, text, "Check the path.")
-    by_stem = {path.stem.lower(): path for path in sorted(photographs_in(masks_folder))}
-    matched = {}
-    for name in names:
+    places = {path.resolve() for path in photos.values()}
+    others = (path for path in sorted(pictures_in(masks_folder)) if path.resolve() not in places)
+    by_stem = {spelling(path.stem): path for path in others}
+    photo_of: dict[Path, str] = {}
+    for name in photos:
         base = Path(name)
-        stems = [base.stem, f"{base.stem}_mask", base.name, f"{base.name}_mask"]
-        masks = [by_stem[stem.lower()] for stem in stems if stem.lower() in by_stem]
-        if masks:
-            matched[name] = masks[0]
-    if not matched:
+        stems = (f"{base.name}_mask", base.name, f"{base.stem}_mask", base.stem)
+        mask = next((by_stem[spelling(stem)] for stem in stems if spelling(stem) in by_stem), None)
+        if mask in photo_of:
+            text = f"The mask {mask.name} could be that of {photo_of[mask]} or of {name}."
+            remedy = "Give each photograph a name of its own, and its mask the same."
+            raise ReconstructionError(ErrorCode.MASK_UNUSABLE, text, remedy)
+        if mask is not None:
+            photo_of[mask] = name
+    if not photo_of:
         text = f"No mask in {masks_folder} is named like a photograph."
-        remedy = f"Name the mask of {names[0]} {Path(names[0]).stem}.png."
-        raise ReconstructionError(ErrorCode.MASK_UNUSABLE, text, remedy)
-    return matched
+        raise ReconstructionError(ErrorCode.MASK_UNUSABLE, text, _naming_text(next(iter(photos))))
+    return {name: mask for mask, name in photo_of.items()}
 
 
 def without_masks_text(names: Sequence[str]) -> str:
     """What to say of photographs without masks where others have some."""
     return (
         f"There is no mask for {first_names(names)}: their background may stay in the mesh. "
-        f"Name the mask of {names[0]} {Path(names[0]).stem}.png."
+        f"{_naming_text(names[0])}"
     )
+
+
+def turned_text(photos: Sequence[Photo]) -> str:
+    """What to say of photographs with masks or cameras that may be of the files' own pixels.
+
+    Empty where EXIF turns none of them, or only such whose shape tells: those taken on their side.
+    """
+    names = [photo.name for photo in photos if photo.exif_orientation != 1 and _keeps_shape(photo)]
+    if not names:
+        return ""
+    return (
+        f"EXIF asks to turn {first_names(names)}: masks and cameras are taken to be of what is then upright. "
+        "If they are not, save these photographs upright and make masks and cameras of them again."
+    )
+
+
+def _keeps_shape(photo: Photo) -> bool:
+    return photo.exif_orientation < 5 or photo.original_width == photo.original_height
+
+
+def unused_masks_text(sources: Sequence[Path]) -> str:
+    """What to say of masks that lie among the photographs where none were asked for; empty without any."""
+    pictures = [path for source in sources for path in (pictures_in(source) if source.is_dir() else [source])]
+    names = sorted({path.name for path in masks_among(pictures)}, key=natural_order)
+    if not names:
+        return ""
+    return (
+        f"By their names these are masks, no photographs, and are not used: {first_names(names)}. "
+        "Name their folder as that of the masks to use them."
+    )
+
+
+def _naming_text(name: str) -> str:
+    # beside the photographs, too, this name makes it a mask
+    return f"Name the mask of {name} {Path(name).stem}_mask.png."
 
 
 def _load_photo(path: Path, name: str, mask_path: Path | None, config: PhotosConfig) -> Photo:
     decoded = read_image(path, config.max_side_px)
-    height, width = decoded.image_srgb.shape[:2]
     if mask_path is None:
         mask = decoded.mask if decoded.mask is None or is_outline(decoded.mask) else None
     else:
-        mask = _load_mask(mask_path, name, width, height)
+        mask = _load_mask(mask_path, name, decoded)
     if mask is not None and mask.max() == 0:
         text = f"The mask of {name} is empty: it leaves nothing of the photograph."
         raise ReconstructionError(ErrorCode.MASK_UNUSABLE, text, "Make the subject white and the rest black.")
@@ -130,6 +184,7 @@ def _load_photo(path: Path, name: str, mask_path: Path | None, config: PhotosCon
         original_width=decoded.original_width,
         original_height=decoded.original_height,
         focal_px=decoded.focal_px,
+        exif_orientation=decoded.exif_orientation,
     )
 
 
@@ -148,19 +203,30 @@ def is_outline(alpha: Float32[np.ndarray, "height width"]) -> bool:
     return bool(frame.mean() < 0.5)
 
 
-def _load_mask(path: Path, photo_name: str, width: int, height: int) -> Float32[np.ndarray, "height width"]:
-    """The mask in a file, scaled to the size of its photograph and to values from 0 to 1."""
+def _load_mask(path: Path, photo_name: str, photo: DecodedImage) -> Float32[np.ndarray, "height width"]:
+    """The mask in a file, scaled to the size of its photograph and to values from 0 to 1.
+
+    One that EXIF does not turn and that fits only the photograph's pixels as stored is turned as they are.
+    """
+    height, width = photo.image_srgb.shape[:2]
     try:
         decoded = read_image(path)
     except ReconstructionError as error:
         raise ReconstructionError(ErrorCode.MASK_UNUSABLE, error.text, error.remedy) from error
-    if not same_shape(decoded.original_width, decoded.original_height, width, height):
+    values = _mask_values(decoded)
+    if decoded.exif_orientation == 1 and not _has_shape(values, width, height):
+        values = upright(values, photo.exif_orientation)
+    if not _has_shape(values, width, height):
         size = f"{decoded.original_width}x{decoded.original_height}"
         text = f"The mask {path.name} ({size}) has another shape than {photo_name} ({width}x{height})."
         raise ReconstructionError(
             ErrorCode.MASK_UNUSABLE, text, "Make masks from the photographs as they are."
         )
-    return resized(_mask_values(decoded), width, height)
+    return resized(values, width, height)
+
+
+def _has_shape(values: Float32[np.ndarray, "_ _"], width: int, height: int) -> bool:
+    return same_shape(values.shape[1], values.shape[0], width, height)
 
 
 def _mask_values(decoded: DecodedImage) -> Float32[np.ndarray, "height width"]:

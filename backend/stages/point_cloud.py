@@ -120,7 +120,7 @@ def _read_text(
     path: Path,
 ) -> tuple[Float64[np.ndarray, "points 3"], Float64[np.ndarray, "points 3"] | None]:
     """Numbers apart by blanks or commas; lines that begin with # say nothing. Raises ValueError."""
-    lines = path.read_text(encoding="utf-8").replace(",", " ").splitlines()
+    lines = path.read_text(encoding="utf-8-sig").replace(",", " ").splitlines()
     if not any(line.strip() and not line.lstrip().startswith("#") for line in lines):
         raise ValueError("it is empty")
     table = np.loadtxt(lines, ndmin=2)

@@ -3,7 +3,8 @@
 The backend names photographs by it, and who shows its results finds them again.
 """
 
-from collections.abc import Sequence
+import unicodedata
+from collections.abc import Collection, Sequence
 from pathlib import Path, PurePosixPath
 
 _OF_PHONES = (".heic", ".heif")
@@ -19,7 +20,17 @@ _OTHER_SUFFIXES = frozenset(
 
 
 def photographs_in(folder: Path) -> list[Path]:
-    """The photographs right in the folder.
+    """The photographs right in the folder: its pictures but for masks of the others.
+
+    Raises OSError where the folder cannot be read.
+    """
+    found = pictures_in(folder)
+    masks = masks_among(found)
+    return [path for path in found if path not in masks]
+
+
+def pictures_in(folder: Path) -> list[Path]:
+    """The pictures right in the folder that can be read, masks too.
 
     What a phone saved counts once where it lies beside a copy in another format, IMG_1.HEIC beside IMG_1.JPG:
     the copy. Raises OSError where the folder cannot be read.
@@ -27,6 +38,13 @@ def photographs_in(folder: Path) -> list[Path]:
     found = [path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES and _is_visible_file(path)]
     copies = {path.stem for path in found if not is_of_phone(path)}
     return [path for path in found if not (is_of_phone(path) and path.stem in copies)]
+
+
+def masks_among(paths: Collection[Path]) -> list[Path]:
+    """Those that are named as masks of others: a_mask.png or a.jpg_mask.png where there is an a.jpg."""
+    named = {spelling(name) for path in paths for name in (path.stem, path.name)}
+    stems = ((path, spelling(path.stem)) for path in paths)
+    return [path for path, stem in stems if stem.endswith("_mask") and stem.removesuffix("_mask") in named]
 
 
 def is_of_phone(path: Path) -> bool:
@@ -66,6 +84,11 @@ def names_of(paths: Sequence[Path]) -> list[str]:
             length += 1
         names.append(PurePosixPath(*parts[-length:]).as_posix())
     return names
+
+
+def spelling(name: str) -> str:
+    """The same for names that differ in letter case, or in how a Mac writes their accents."""
+    return unicodedata.normalize("NFC", name).lower()
 
 
 def is_named(path: Path, name: str) -> bool:

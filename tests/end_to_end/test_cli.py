@@ -413,6 +413,24 @@ def test_a_folder_whose_name_stdout_cannot_say_gets_its_results(case: Case) -> N
     assert (output / "mesh.ply").is_file()
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="elsewhere the names of files are text")
+def test_a_photograph_whose_name_is_no_text_is_one_like_others(case: Case) -> None:
+    """As a Latin-1 disk or archive leaves it; terminal, log, pages and messages name it."""
+    (case.photos / "1.png").rename(case.photos / os.fsdecode(b"f\xfcr.png"))
+    masks = case.folder / "masks"
+    masks.mkdir()
+    Image.new("L", (6, 4), 255).save(masks / "2.png")
+    result = case.run("none", "none", "--masks", str(masks))
+    assert result.returncode == 0, result.stderr
+    assert set(case.results()) == RESULTS
+    assert r"f\udcfcr.png" in result.stderr
+    for name in ("log.txt", "report.html", "cameras.json"):
+        assert rb"f\udcfcr.png" in case.results()[name], name
+    heard = converse(case, masks="masks", seed=5)
+    assert isinstance(heard[-1], Finished)
+    assert any(r"f\udcfcr.png" in str(message) for message in heard)
+
+
 def test_a_missing_truth_is_told_before_the_work(case: Case) -> None:
     result = case.run("none", "none", "--truth", str(case.folder / "none.ply"))
     assert result.returncode == 2
@@ -479,6 +497,7 @@ def test_the_second_ctrl_c_ends_at_once(case: Case) -> None:
 
 def test_a_job_file_gives_a_conversation(case: Case) -> None:
     job = case.write_job()
+    job.write_text(job.read_text(), encoding="utf-8-sig")  # as editors on Windows save it
     with case.start(0.0, str(job)) as process:
         assert process.stdout is not None
         heard = messages(process.stdout.read())

@@ -2,6 +2,7 @@
 
 import json
 import re
+import unicodedata
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -19,6 +20,7 @@ from backend.scene import Photo, Region, SolvedCameras, Unplaced, no_progress, t
 from backend.stages.cameras import CamerasConfig, solve_cameras
 from backend.stages.known_cameras import checked_pose, match_by_name, read_cameras
 from backend.stages.nerfstudio import OPENCV_FROM_OPENGL, frame_lens, transforms_json
+from tests.lens_models import LENSES
 
 WIDTH, HEIGHT = 64, 48
 
@@ -79,26 +81,6 @@ def test_transforms_are_read_as_they_were_written(tmp_path: Path) -> None:
         np.testing.assert_array_equal(view.image_srgb, photo.image_srgb)
 
 
-LENSES = {
-    "SIMPLE_PINHOLE": [150.0, 83.0, 57.0],
-    "PINHOLE": [150.0, 153.0, 83.0, 57.0],
-    "SIMPLE_RADIAL": [150.0, 80.0, 60.0, -0.2],
-    "RADIAL": [150.0, 82.0, 57.0, 0.15, 0.02],
-    "OPENCV": [150.0, 153.0, 78.0, 61.0, -0.15, 0.03, 0.004, -0.003],
-    "FULL_OPENCV": [150.0, 151.0, 80.0, 60.0, -0.2, 0.05, 0.001, 0.002, 0.01, 0.02, 0.003, 0.001],
-    "SIMPLE_FISHEYE": [90.0, 80.0, 60.0],
-    "FISHEYE": [90.0, 92.0, 80.0, 60.0],
-    "SIMPLE_RADIAL_FISHEYE": [90.0, 80.0, 60.0, 0.02],
-    "RADIAL_FISHEYE": [90.0, 80.0, 60.0, 0.02, -0.01],
-    "OPENCV_FISHEYE": [90.0, 91.0, 80.0, 60.0, 0.02, -0.01, 0.003, -0.001],
-    "FOV": [100.0, 101.0, 80.0, 60.0, 0.8],
-    "THIN_PRISM_FISHEYE": [90.0, 91.0, 80.0, 60.0, 0.01, 0.002, 0.001, 0.002, 0.003, 0.001, 0.001, 0.002],
-    "RAD_TAN_THIN_PRISM_FISHEYE": [90.0, 91.0, 80.0, 60.0, 0.01, *[0.001] * 11],
-    "SIMPLE_DIVISION": [150.0, 80.0, 60.0, -0.1],
-    "DIVISION": [150.0, 151.0, 80.0, 60.0, -0.1],
-    "EUCM": [100.0, 101.0, 80.0, 60.0, 0.5, 1.1],
-}
-"""Parameters of every perspective model of COLMAP over 160x120 pixels."""
 WITHOUT_WORDS = [name for name in LENSES if re.search("FOV|PRISM|DIVISION|EUCM", name)]
 """Models that nerfstudio's files cannot say."""
 
@@ -396,6 +378,9 @@ def flatten_it(pose: np.ndarray) -> None:
         {"fl_x": "60"},
         {"fl_x": -60.0, "fl_y": -60.0},
         {"fl_x": None, "fl_y": None},
+        {"fl_x": None, "fl_y": 0, "camera_angle_x": None, "camera_angle_y": 0.0},
+        {"w": -WIDTH, "h": -HEIGHT},
+        {"w": 1e30 * WIDTH, "h": 1e30 * HEIGHT},
         {"camera_model": "EQUIRECTANGULAR"},
         {"k4": 0.1},
         {"k1": -9.0, "k2": -900.0},
@@ -478,6 +463,44 @@ def test_colmap_models_with_their_points(text: bool, below: str, tmp_path: Path)
             solved.sparse_positions[solved.sparse_visibility[:, number]].mean(axis=0), mean, atol=1e-6
         )
     assert left_out not in photographed
+
+
+def test_names_with_blanks_in_a_text_model(tmp_path: Path) -> None:
+    photos = [make_photo(f"my photo {photo.name}", scale=2.5) for photo in PHOTOS]
+    folder = colmap_model(tmp_path, "PINHOLE")
+    text = (folder / "images.txt").read_text()
+    for photo in PHOTOS:
+        text = text.replace(photo.name, f"sub dir/my photo {photo.name}")
+    text = text.replace("\n\n", "\n1.5 2.5 -1 3.5 4.5 -1 5.5 6.5 -1 7.5 8.5 -1\n", 1)
+    (folder / "images.txt").write_text(f"# images\n\n{text}")
+    solved = solve(photos, folder, tmp_path)
+    plain = solve([replace(photo, name=photo.name) for photo in photos], in_binary(folder, photos), tmp_path)
+    assert [view.name for view in solved.views] == [photo.name for photo in photos]
+    for view, other in zip(solved.views, plain.views, strict=True):
+        np.testing.assert_array_equal(view.camera.camera_from_world, other.camera.camera_from_world)
+
+
+def in_binary(folder: Path, photos: list[Photo]) -> Path:
+    """The same model as COLMAP writes it by default, which keeps names whole."""
+    model = pycolmap.Reconstruction(folder)
+    for number, photo in enumerate(photos, start=1):
+        model.images[number].name = photo.name
+    binary = folder.with_name("binary")
+    binary.mkdir()
+    model.write_binary(binary)
+    return binary
+
+
+@pytest.mark.parametrize(("ours", "theirs"), [("NFC", "NFD"), ("NFD", "NFC")])
+def test_accents_may_be_written_as_a_mac_does(ours: str, theirs: str) -> None:
+    photo, camera = (unicodedata.normalize(form, "für/Öl.jpg") for form in (ours, theirs))
+    assert match_by_name([photo], [camera]) == {0: 0}
+
+
+def test_a_mark_of_the_byte_order_does_no_harm(tmp_path: Path) -> None:
+    """As editors on Windows write it."""
+    (tmp_path / "transforms.json").write_text(json.dumps({"frames": FRAMES}), encoding="utf-8-sig")
+    assert len(solve(PHOTOS, tmp_path, tmp_path).views) == 3
 
 
 def test_a_damaged_colmap_model_is_refused(tmp_path: Path) -> None:

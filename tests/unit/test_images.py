@@ -1,5 +1,6 @@
 """Image files against what was written into them."""
 
+import struct
 from pathlib import Path
 
 import numpy as np
@@ -199,6 +200,30 @@ def test_senseless_exif_is_no_focal_length(value: object) -> None:
     exif = Image.Exif()
     exif.get_ifd(ExifTags.IFD.Exif)[ExifTags.Base.FocalLengthIn35mmFilm] = value
     assert focal_px_or_none(exif, 100, 100) is None
+
+
+@pytest.mark.parametrize(
+    ("size", "words"),
+    [
+        ((16320, 12240), "a.bmp cannot be read"),  # as phones have: only the pixels are missing
+        ((23200, 17400), "a.bmp cannot be read"),  # of a sensor that is shifted
+        ((30_000, 30_000), "a.bmp is too large: more than 500 million pixels"),
+    ],
+)
+def test_more_pixels_than_any_camera_has_are_refused(
+    size: tuple[int, int], words: str, tmp_path: Path
+) -> None:
+    """A bitmap's header is enough: its size is looked at before its pixels."""
+    path = tmp_path / "a.bmp"
+    Image.new("1", (8, 8)).save(path)
+    content = bytearray(path.read_bytes())
+    content[18:26] = struct.pack("<ii", *size)
+    path.write_bytes(content)
+    with pytest.raises(ReconstructionError) as caught:
+        read_image(path)
+    assert caught.value.code == ErrorCode.PHOTO_UNREADABLE
+    assert words in caught.value.text
+    assert "bomb" not in caught.value.text
 
 
 @pytest.mark.parametrize("suffix", ["jpg", "png", "tif", "heic"])

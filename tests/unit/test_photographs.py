@@ -50,6 +50,11 @@ def test_photographs_of_a_folder(tmp_path: Path) -> None:
     assert sorted(path.name for path in photographs_in(tmp_path)) == ["1.jpg", "2.HEIC", "3.WEBP", "4.bmp"]
 
 
+def test_masks_of_photographs_are_none(tmp_path: Path) -> None:
+    touched(tmp_path, "1.jpg", "1_mask.png", "2.HEIC", "2.JPG", "2.jpg_MASK.png", "3_mask.png")
+    assert sorted(path.name for path in photographs_in(tmp_path)) == ["1.jpg", "2.JPG", "3_mask.png"]
+
+
 def test_what_a_phone_saved_and_its_copy_are_one_photograph(tmp_path: Path) -> None:
     touched(tmp_path, "IMG_1.HEIC", "IMG_1.JPG", "IMG_2.HEIC", "IMG_3.jpg", "IMG_4.heif", "IMG_4.png")
     found = sorted(path.name for path in photographs_in(tmp_path))

@@ -1,5 +1,6 @@
 """Loading photographs: order, names, sizes, masks and refusals."""
 
+import unicodedata
 from pathlib import Path
 
 import numpy as np
@@ -8,7 +9,15 @@ from PIL import ExifTags, Image
 
 from backend.errors import Cancelled, ErrorCode, ReconstructionError
 from backend.scene import Photo, no_progress
-from backend.stages.photos import PhotosConfig, is_outline, load_photos, match_masks, natural_order
+from backend.stages.photos import (
+    PhotosConfig,
+    is_outline,
+    load_photos,
+    match_masks,
+    natural_order,
+    turned_text,
+    unused_masks_text,
+)
 
 CONFIG = PhotosConfig(max_side_px=100)
 
@@ -86,7 +95,9 @@ def test_an_unreadable_photograph_is_named(tmp_path: Path) -> None:
 def test_masks_are_found_by_name(mask_name: str, tmp_path: Path) -> None:
     path = write(tmp_path / mask_name)
     write(tmp_path / "ab.png")
-    assert match_masks(["a.jpg", "c.jpg"], tmp_path) == {"a.jpg": path}
+    assert match_masks({name: Path("photos") / name for name in ("a.jpg", "c.jpg")}, tmp_path) == {
+        "a.jpg": path
+    }
 
 
 def test_a_mask_of_another_size_is_scaled(tmp_path: Path) -> None:
@@ -160,3 +171,89 @@ def test_an_alpha_that_is_opaque_along_the_edges_is_no_outline() -> None:
     valid[:2], valid[:, -1] = 0, 0  # what undistortion leaves
     assert is_outline(subject)
     assert not is_outline(valid)
+
+
+def test_masks_beside_the_photographs_are_masks_and_no_photographs(tmp_path: Path) -> None:
+    """Photographs are given as their folder, or as everything in it."""
+    for name in ["a.jpg", "b.JPG", "c.png"]:
+        write(tmp_path / name)
+    for name in ["a_mask.png", "B_mask.png", "c.png_mask.png", "another_mask.png"]:
+        write(tmp_path / name, level=255)
+    for sources in ([tmp_path], sorted(tmp_path.iterdir())):
+        photos = load(sources, tmp_path)
+        assert [photo.name for photo in photos] == ["a.jpg", "another_mask.png", "b.JPG", "c.png"]
+        masked = [photo.name for photo in photos if photo.mask is not None and photo.mask.min() == 1]
+        assert masked == ["a.jpg", "b.JPG", "c.png"]
+        assert "a_mask.png, B_mask.png, c.png_mask.png" in unused_masks_text(sources)
+    assert unused_masks_text([tmp_path / "a.jpg", tmp_path / "b.JPG"]) == ""
+
+
+def test_no_photograph_is_its_own_mask(tmp_path: Path) -> None:
+    for name in ["a.png", "b.png"]:
+        write(tmp_path / name, level=255)
+    error = refusal([tmp_path], tmp_path)
+    assert error.code == ErrorCode.MASK_UNUSABLE
+    assert error.remedy == "Name the mask of a.png a_mask.png."
+
+
+def test_what_a_phone_saved_beside_the_photograph_is_no_mask(tmp_path: Path) -> None:
+    for name in ["a.JPG", "b.JPG", "b_mask.png"]:
+        write(tmp_path / name, level=255)
+    (tmp_path / "a.heic").touch()
+    assert [photo.mask is None for photo in load([tmp_path], tmp_path)] == [True, False]
+
+
+def test_a_mask_of_two_photographs_is_refused(tmp_path: Path) -> None:
+    photos = [write(tmp_path / folder / "IMG_1.jpg") for folder in "lr"]
+    write(tmp_path / "masks" / "IMG_1.png", level=255)
+    error = refusal(photos, tmp_path / "masks")
+    assert error.code == ErrorCode.MASK_UNUSABLE
+    assert "IMG_1.png could be that of l/IMG_1.jpg or of r/IMG_1.jpg" in error.text
+
+
+def test_masks_named_in_full_tell_photographs_apart(tmp_path: Path) -> None:
+    photos = {name: tmp_path / name for name in ("a.jpg", "a.tif")}
+    masks = {name: write(tmp_path / "masks" / f"{name}.png") for name in photos}
+    write(tmp_path / "masks" / "a.png")
+    assert match_masks(photos, tmp_path / "masks") == masks
+
+
+def test_accents_may_be_written_as_a_mac_does(tmp_path: Path) -> None:
+    name, mask = (unicodedata.normalize(form, "Fuß für.jpg") for form in ("NFC", "NFD"))
+    path = write(tmp_path / mask)
+    assert match_masks({name: Path("photos") / name}, tmp_path) == {name: path}
+
+
+def write_turned(path: Path, pixels: np.ndarray, orientation: int) -> None:
+    path.parent.mkdir(exist_ok=True)
+    exif = Image.Exif()
+    exif[ExifTags.Base.Orientation] = orientation
+    Image.fromarray(pixels).save(path, exif=exif)
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+@pytest.mark.parametrize("mask_knows", [True, False])
+def test_masks_are_turned_with_their_photographs(orientation: int, mask_knows: bool, tmp_path: Path) -> None:
+    """Those of the pixels as stored: they say so themselves, or their shape tells."""
+    pixels = np.zeros((30, 40), np.uint8)
+    pixels[4:10, 2:12] = 255
+    for name in ["a.png", "b.png"]:
+        write_turned(tmp_path / "photos" / name, pixels, orientation)
+    write_turned(tmp_path / "masks" / "a.png", pixels, orientation if mask_knows else 1)
+    photo = load([tmp_path / "photos"], tmp_path / "masks")[0]
+    assert photo.mask is not None
+    assert photo.exif_orientation == orientation
+    if mask_knows or orientation == 1 or orientation >= 5:
+        np.testing.assert_array_equal(photo.mask, photo.image_srgb[..., 0])
+    assert ("a.png" in turned_text([photo])) == (orientation in (2, 3, 4))
+
+
+def test_an_upright_mask_stays_so(tmp_path: Path) -> None:
+    pixels = np.zeros((30, 40), np.uint8)
+    pixels[4:10, 2:12] = 255
+    for name in ["a.png", "b.png"]:
+        write_turned(tmp_path / "photos" / name, pixels, 6)
+    write_turned(tmp_path / "masks" / "a.png", np.rot90(pixels, -1), 1)
+    photo = load([tmp_path / "photos"], tmp_path / "masks")[0]
+    assert photo.mask is not None
+    np.testing.assert_array_equal(photo.mask, photo.image_srgb[..., 0])

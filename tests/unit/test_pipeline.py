@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from PIL import Image
+from PIL import ExifTags, Image
 
 from backend import pipeline, workspace
 from backend.errors import Cancelled, ErrorCode, ReconstructionError
@@ -81,6 +81,14 @@ def up_to_the_cameras(job: Job, listener: Listener | None = None) -> tuple[Photo
     return given[0]
 
 
+def found_and_warned(job: Job) -> tuple[tuple[Photo, ...], list[str]]:
+    """The photographs that cameras would be found for, and what the user was told until then."""
+    warned: list[str] = []
+    listener = Quiet()
+    listener.warned = warned.append  # type: ignore[method-assign]
+    return up_to_the_cameras(job, listener), warned
+
+
 def job_of(images: Path, **changes: Any) -> Job:
     return Job(images=(images,), output=images.parent / "out", device="cpu", **changes)
 
@@ -140,7 +148,35 @@ def test_photographs_without_masks_among_others_with_masks_are_told(photos: Path
     up_to_the_cameras(job_of(photos, masks=masks), listener)
     (text,) = warned
     assert "no mask for 1.png:" in text
-    assert "Name the mask of 1.png 1.png" in text
+    assert "Name the mask of 1.png 1_mask.png" in text
+
+
+def test_masks_among_the_photographs_that_nobody_asked_for_are_told(photos: Path) -> None:
+    Image.new("L", (6, 4), 255).save(photos / "1_mask.png")
+    found, warned = found_and_warned(job_of(photos))
+    assert [photo.name for photo in found] == ["0.png", "1.png", "2.png"]
+    assert all(photo.mask is None for photo in found)
+    (text,) = warned
+    assert "1_mask.png" in text
+    found, _ = found_and_warned(job_of(photos, masks=photos))
+    assert [photo.name for photo in found if photo.mask is not None] == ["1.png"]
+
+
+@pytest.mark.parametrize(
+    ("given", "told"), [({}, False), ({"masks": "masks"}, True), ({"cameras": "transforms.json"}, True)]
+)
+def test_what_may_not_be_turned_with_its_photograph_is_told(
+    given: dict[str, str], told: bool, photos: Path, tmp_path: Path
+) -> None:
+    """Upside down or not: the shape of a mask or camera does not tell."""
+    exif = Image.Exif()
+    exif[ExifTags.Base.Orientation] = 3
+    Image.new("RGB", (6, 4)).save(photos / "1.png", exif=exif)
+    make_photos(tmp_path / "masks", 5)
+    (tmp_path / "transforms.json").write_text('{"frames": []}')
+    _, warned = found_and_warned(job_of(photos, **{name: tmp_path / path for name, path in given.items()}))
+    assert [text for text in warned if "EXIF asks to turn 1.png:" in text] == warned
+    assert bool(warned) == told
 
 
 def test_a_finished_job_is_not_replaced_by_another_shoot(photos: Path, tmp_path: Path) -> None:

@@ -23,10 +23,12 @@ def refusal(path: Path) -> str:
 
 @pytest.mark.parametrize("separator", [" ", ",", "\t"])
 @pytest.mark.parametrize("columns", [3, 6])
-def test_text_files(tmp_path: Path, separator: str, columns: int) -> None:
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig"])
+def test_text_files(tmp_path: Path, separator: str, columns: int, encoding: str) -> None:
     table = np.random.default_rng(0).normal(size=(50, columns))
     path = tmp_path / "cloud.xyz"
     np.savetxt(path, table, delimiter=separator, header="a remark")
+    path.write_text(path.read_text(), encoding=encoding)
     cloud = read_cloud(path)
     np.testing.assert_allclose(cloud.positions, table[:, :3])
     if columns == 3:

@@ -1,0 +1,143 @@
+"""Cameras of a file's own pixels, turned with their photograph: every lens, every orientation."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+from PIL import ExifTags, Image
+
+from backend.errors import ErrorCode, ReconstructionError
+from backend.maths.sampling import colours_at
+from backend.scene import Photo, Region, no_progress
+from backend.stages.cameras import CamerasConfig, solve_cameras
+from backend.stages.known_cameras import may_be_unturned, read_placement
+from backend.stages.lenses import Placement, undistorted_view
+from backend.stages.nerfstudio import transforms_json
+from backend.stages.photos import PhotosConfig, load_photos
+from backend.stages.stored_pixels import turned_clockwise
+from tests.lens_models import LENSES
+
+WIDTH, HEIGHT = 160, 120
+RED_DOT_WORLD = np.array([[-0.3, -0.7, 3.0]])
+
+
+def photographs(folder: Path, orientation: int, width: int = WIDTH) -> tuple[Photo, ...]:
+    """Two files whose stored pixels show a red dot, around column 65 and row 25."""
+    pixels = np.zeros((HEIGHT, width, 3), np.uint8)
+    pixels[20:30, 60:70] = (255, 0, 0)
+    exif = Image.Exif()
+    exif[ExifTags.Base.Orientation] = orientation
+    for name in ("a.png", "b.png"):
+        Image.fromarray(pixels).save(folder / name, exif=exif)
+    return load_photos([folder / "a.png", folder / "b.png"], None, PhotosConfig(), progress=no_progress)
+
+
+def model(folder: Path, width: int = WIDTH) -> Path:
+    """A COLMAP model that sees the dot in the stored pixels."""
+    (folder / "cameras.txt").write_text(f"1 PINHOLE {width} {HEIGHT} 150 150 80 60\n")
+    (folder / "images.txt").write_text("1 1 0 0 0 0 0 0 1 a.png\n\n2 1 0 0 0 0 0 0 1 b.png\n\n")
+    (folder / "points3D.txt").write_text("")
+    return folder
+
+
+def transforms(folder: Path, width: int = WIDTH, height: int = HEIGHT) -> Path:
+    """The same cameras as a transforms.json."""
+    pose = np.diag([1.0, -1.0, -1.0, 1.0]).tolist()
+    frames = [{"file_path": name, "transform_matrix": pose} for name in ("a.png", "b.png")]
+    lens = {"w": width, "h": height, "fl_x": 150, "fl_y": 150, "cx": 80, "cy": 60}
+    path = folder / "transforms.json"
+    path.write_text(json.dumps({**lens, "frames": frames}))
+    return path
+
+
+def redness_of_the_dot(photos: tuple[Photo, ...], placement: Placement) -> float:
+    view = undistorted_view(photos[0], placement.placed[0])
+    return float(colours_at(view, RED_DOT_WORLD)[0, 0])
+
+
+@pytest.mark.parametrize("orientation", [1, 3, 6, 8])
+@pytest.mark.parametrize("width", [WIDTH, HEIGHT])
+def test_cameras_of_a_colmap_model_are_turned_with_their_photographs(
+    orientation: int, width: int, tmp_path: Path
+) -> None:
+    """Also where a square picture does not tell whether it lies on its side."""
+    photos = photographs(tmp_path, orientation, width)
+    placement = read_placement(photos, model(tmp_path, width))
+    assert redness_of_the_dot(photos, placement) == 1
+    told = [f"{decision.choice} {decision.because}" for decision in placement.decisions]
+    assert len(told) == (orientation != 1)
+    assert all("a.png, b.png" in text for text in told)
+
+
+@pytest.mark.parametrize("orientation", [6, 8])
+def test_cameras_of_a_transforms_json_are_turned_where_their_shape_says_so(
+    orientation: int, tmp_path: Path
+) -> None:
+    photos = photographs(tmp_path, orientation)
+    placement = read_placement(photos, transforms(tmp_path))
+    assert redness_of_the_dot(photos, placement) == 1
+    assert len(placement.decisions) == 1
+
+
+@pytest.mark.parametrize(("orientation", "shape"), [(3, (WIDTH, HEIGHT)), (6, (HEIGHT, WIDTH))])
+def test_else_they_are_those_of_upright_photographs(
+    orientation: int, shape: tuple[int, int], tmp_path: Path
+) -> None:
+    photos = photographs(tmp_path, orientation)
+    given = transforms(tmp_path, *shape)
+    placement = read_placement(photos, given)
+    np.testing.assert_array_equal(placement.placed[0].camera_from_world, np.eye(4))
+    assert (placement.placed[0].lens.width, placement.placed[0].lens.height) == shape
+    assert placement.decisions == ()
+    assert may_be_unturned(given)
+
+
+def test_our_own_file_and_a_model_say_how_they_are_turned(tmp_path: Path) -> None:
+    path = transforms(tmp_path)
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"fewview": {"estimated": False}}))
+    assert not may_be_unturned(path)
+    path.unlink()
+    assert not may_be_unturned(model(tmp_path))
+
+
+def test_cameras_of_copies_that_were_saved_upright_stay(tmp_path: Path) -> None:
+    photos = photographs(tmp_path, 6)
+    (tmp_path / "copies").mkdir()
+    folder = model(tmp_path / "copies")
+    (folder / "cameras.txt").write_text(f"1 PINHOLE {HEIGHT} {WIDTH} 150 150 60 80\n")
+    placement = read_placement(photos, folder)
+    np.testing.assert_array_equal(placement.placed[0].camera_from_world, np.eye(4))
+
+
+@pytest.mark.parametrize("orientation", [2, 4, 5, 7])
+def test_mirrored_files_are_refused(orientation: int, tmp_path: Path) -> None:
+    """No camera in a right-handed world sees what COLMAP saw."""
+    photos = photographs(tmp_path, orientation)
+    with pytest.raises(ReconstructionError, match=r"a\.png is stored mirrored") as caught:
+        read_placement(photos, model(tmp_path))
+    assert caught.value.code == ErrorCode.CAMERAS_UNUSABLE
+
+
+@pytest.mark.parametrize("name", LENSES)
+def test_a_turned_lens_sees_what_the_lens_sees_turned(name: str) -> None:
+    lens = pycolmap.Camera(model=name, width=WIDTH, height=HEIGHT, params=LENSES[name])
+    turned = turned_clockwise(lens)
+    assert (turned.width, turned.height) == (HEIGHT, WIDTH)
+    x, y, z = np.random.default_rng(0).uniform([[-0.4], [-0.3], [1.0]], [[0.4], [0.3], [1.2]], (3, 50))
+    column, row = lens.img_from_cam(np.column_stack([x, y, z])).T
+    seen = turned.img_from_cam(np.column_stack([-y, x, z]))
+    np.testing.assert_allclose(seen, np.column_stack([HEIGHT - row, column]), atol=1e-9)
+
+
+@pytest.mark.parametrize("orientation", [3, 6])
+def test_what_is_written_of_turned_cameras_is_not_turned_again(orientation: int, tmp_path: Path) -> None:
+    photos = photographs(tmp_path, orientation)
+    solved = solve_cameras(
+        photos, model(tmp_path), CamerasConfig(), workdir=tmp_path, seed=0, progress=no_progress
+    )
+    region = Region(object_from_world=np.eye(4))
+    path = tmp_path / "cameras.json"
+    path.write_text(json.dumps(transforms_json(solved, region)))
+    assert redness_of_the_dot(photos, read_placement(photos, path)) == 1
