@@ -21,7 +21,7 @@ import torch
 
 from .errors import ErrorCode, ReconstructionError
 from .machine import choose_device, peak_memory_bytes, set_up_torch
-from .maths.metrics import load_truth
+from .maths.metrics import elsewhere_text, load_truth
 from .mesh_files import SPARSE
 from .presets import Settings
 from .previews import Previews
@@ -362,6 +362,8 @@ def _reconstructed(
     surface = this.stage("train", fit)
     extract = partial(stages.extract_mesh, views, region, stereo, surface, settings.mesh, originals=originals)
     mesh = this.stage("mesh", extract)
+    if job.truth is not None and (text := elsewhere_text(mesh, load_truth(job.truth))):
+        this.warn(text)
     inputs = ReportInputs(
         job_name=job.output.resolve().name,
         settings=settings,

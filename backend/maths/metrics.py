@@ -13,6 +13,7 @@ are still half a sample spacing apart: 0.1 % for 200,000 points on a sphere.
 Definitions of the F-score after Knapitsch et al., "Tanks and Temples" (2017), section 4.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -40,6 +41,9 @@ READ_FAILURES = (
 
 _WORLD_FROM_GLTF = np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]], np.float64)
 """glTF has y up, the world of rendered views z up: as Blender's importer and our own mesh.glb have it."""
+
+_SCALE = 1.7
+"""Times as large as the truth, or as small, what is no part of it and no hull around it any more."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -140,6 +144,24 @@ def vertex_error_percent(
     samples = _sample_truth(truth, num_samples, np.random.default_rng(seed))
     distance, _ = _nearest(mesh.vertices, samples.positions)
     return (distance * (100 / truth.diagonal)).astype(np.float32)
+
+
+def elsewhere_text(mesh: SurfaceMesh, truth: TrueSurface) -> str:
+    """For a person: that the truth has another scale or place than the mesh; empty where it has not."""
+    low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
+    diagonal = float(np.linalg.norm(high - low))
+    larger = truth.diagonal / diagonal if diagonal > 0 else math.inf
+    middle = (truth.vertices.min(axis=0) + truth.vertices.max(axis=0)) / 2
+    apart = float(np.linalg.norm((low + high) / 2 - middle))
+    if not 1 / _SCALE < larger < _SCALE:
+        text = f"{larger:.3g} times as large as the mesh"
+    elif apart > (diagonal + truth.diagonal) / 4:
+        text = f"{apart / truth.diagonal:.2g} of its diagonals beside the mesh"
+    else:
+        return ""
+    return (
+        f"The true surface is {text}: errors say so, and nothing of the shape. Give it in the cameras' frame."
+    )
 
 
 def psnr(

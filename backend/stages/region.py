@@ -5,7 +5,7 @@ points say where the photographs overlap; without those, the cameras' axes say w
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
@@ -28,6 +28,12 @@ LEAST_COMMON = 0.6
 right or a twentieth of the picture off; in the worst photograph 0.2 to 0.5 if one of them is inverted."""
 
 
+_FINER = 3
+"""Times as many cells along each axis, where those that are enough for most things find masks in conflict."""
+_CLOSE_UP = 0.5
+"""Share of what the median photograph shows of the subject's place, below which one is a close-up."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class RegionConfig:
     """Where to look, if it is not to be found automatically."""
@@ -48,16 +54,21 @@ def find_region(solved: SolvedCameras, config: RegionConfig, *, progress: Progre
     """
     progress(0.0, "finding the subject")
     if config.centre_world is not None and config.radius_world is not None:
-        return _region(np.array(config.centre_world), config.radius_world, "as given", "set by the user")
+        centre = np.array(config.centre_world)
+        _check_shown(centre, config.radius_world, [view.camera for view in solved.views])
+        return _region(centre, config.radius_world, "as given", "set by the user")
     masked = [view for view in solved.views if view.mask is not None]
     if len(masked) >= 2:
-        centre, radius = _of_masks(masked, config)
+        try:
+            centre, radius = _of_masks(masked, config)
+        except ReconstructionError:  # narrow bars may fall between the middles of all cells
+            centre, radius = _of_masks(masked, replace(config, hull_cells=_FINER * config.hull_cells))
         return _region(
             centre, radius * config.margin, "the masked subject", f"{len(masked)} photographs have masks"
         )
-    cameras = [view.camera for view in solved.views]
+    cameras = _overviews([view.camera for view in solved.views])
     if len(solved.sparse_positions) >= 20:
-        centre, radius = _of_points(solved)
+        centre, radius = _of_points(solved, cameras)
         middle, within = _shown_whole(cameras)
         share = float((np.linalg.norm(solved.sparse_positions - middle, axis=1) < within).mean())
         if 0 < ROOM * within <= radius and share > 0.5:
@@ -74,6 +85,37 @@ def find_region(solved: SolvedCameras, config: RegionConfig, *, progress: Progre
 def _region(centre: Float64[np.ndarray, "3"], radius: float, choice: str, because: str) -> Region:
     decision = Decision(what="region", choice=choice, because=because)
     return Region(object_from_world=to_unit_sphere(centre, radius), decisions=(decision,))
+
+
+def _check_shown(centre: Float64[np.ndarray, "3"], radius: float, cameras: list[Camera]) -> None:
+    """Raises ReconstructionError(SETTINGS_INVALID) for a region that fewer than two photographs show."""
+    steps = np.linspace(-1, 1, 15)
+    ball = np.stack(np.meshgrid(steps, steps, steps), axis=-1).reshape(-1, 3)
+    ball = ball[np.linalg.norm(ball, axis=1) <= 1] * radius + centre
+    showing = [camera for camera in cameras if in_picture(ball, camera).any()]
+    around = [camera for camera in cameras if np.linalg.norm(camera.position - centre) < radius]
+    if len(showing) < 2 and len(around) < 2:
+        where = ", ".join(f"{value:g}" for value in centre)
+        raise ReconstructionError(
+            ErrorCode.SETTINGS_INVALID,
+            f"The region that was given, of radius {radius:g} around ({where}), is in the picture of "
+            f"{len(showing)} of {len(cameras)} photographs.",
+            "Give it in the frame of the cameras, around the subject, or leave it out.",
+        )
+
+
+def _overviews(cameras: list[Camera]) -> list[Camera]:
+    """Those that show about as much as most do: what is not in a close-up may be the subject."""
+    centre = nearest_to_axes(cameras)
+    shown_world = np.array(
+        [
+            np.linalg.norm(camera.position - centre)
+            * min(camera.width / camera.fx_px, camera.height / camera.fy_px)
+            for camera in cameras
+        ]
+    )
+    wide = shown_world > _CLOSE_UP * np.median(shown_world)
+    return [camera for camera, shows in zip(cameras, wide, strict=True) if shows]
 
 
 def nearest_to_axes(cameras: list[Camera]) -> Float64[np.ndarray, "3"]:
@@ -124,17 +166,17 @@ def _radius_in_frame(camera: Camera, centre: Float64[np.ndarray, "3"]) -> float:
     return float((sides @ [x, y, z] / np.linalg.norm(sides, axis=1)).min())
 
 
-def _of_points(solved: SolvedCameras) -> tuple[Float64[np.ndarray, "3"], float]:
+def _of_points(solved: SolvedCameras, cameras: list[Camera]) -> tuple[Float64[np.ndarray, "3"], float]:
     """A sphere around the bulk of the points, each weighing as much as photographs see it.
 
-    The subject is what nearly all photographs have in their frames: what lies behind it for one camera is
-    behind or beside another. Of what is left, the weighted median and a high quantile of the distances
+    The subject is what nearly all of these cameras have in their frames: what lies behind it for one camera
+    is behind or beside another. Of what is left, the weighted median and a high quantile of the distances
     leave out the few that are far.
     """
     weight = solved.sparse_visibility.sum(axis=1).astype(np.float64) - 1
     weight = np.maximum(weight, 0.1)
     points = solved.sparse_positions
-    framed = np.mean([in_picture(points, view.camera) for view in solved.views], axis=0) > 0.8
+    framed = np.mean([in_picture(points, camera) for camera in cameras], axis=0) > 0.8
     if framed.sum() >= 20:
         points, weight = points[framed], weight[framed]
     centre = np.array([weighted_quantile(points[:, axis], weight, 0.5) for axis in range(3)])

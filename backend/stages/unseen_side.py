@@ -105,7 +105,7 @@ def _half_width(scene: Measurements, at: Float[Tensor, "3"]) -> float:
     """Largest half extent of the subject across the views, at the distance of a point of it."""
     widths = []
     for camera, outline in zip(scene.cameras, scene.outlines, strict=True):
-        if outline is not None:
+        if outline is not None and bool((outline < 0).any()):
             rows, columns = torch.nonzero(outline < 0, as_tuple=True)
             middle_r, middle_c = (rows.max() + rows.min()) / 2, (columns.max() + columns.min()) / 2
             reach_px = torch.hypot(rows - middle_r, columns - middle_c).max()

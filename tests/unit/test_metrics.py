@@ -14,6 +14,7 @@ import trimesh
 from backend.errors import ErrorCode, ReconstructionError
 from backend.maths.metrics import (
     TrueSurface,
+    elsewhere_text,
     load_truth,
     psnr,
     surface_error,
@@ -22,6 +23,23 @@ from backend.maths.metrics import (
 from backend.scene import Camera, SurfaceMesh
 
 YARDSTICK = Path(__file__).resolve().parents[2] / ".." / "shared" / "tools" / "mesh_error.py"
+
+
+@pytest.mark.parametrize(
+    ("scale", "shift", "told"),
+    [
+        (1.0, 0.0, ""),
+        (1.4, 0.3, ""),
+        (1000.0, 0.0, "1e+03 times as large"),
+        (0.5, 0.0, "0.5 times as large"),
+        (1.0, 5.0, "1.4 of its diagonals beside"),
+    ],
+)
+def test_a_truth_of_another_scale_or_place_is_told(scale: float, shift: float, told: str) -> None:
+    vertices = scale * ball(1.0, 3).vertices + [shift, 0, 0]
+    text = elsewhere_text(ball(1.0, 3), TrueSurface(vertices=vertices, faces=None))
+    assert told in text
+    assert bool(text) == bool(told)
 
 
 def surface_mesh(vertices: np.ndarray, faces: np.ndarray) -> SurfaceMesh:

@@ -5,11 +5,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from backend.errors import ErrorCode, ReconstructionError
+from backend.maths.projection import projected
+from backend.maths.raycast import RayCaster, camera_rays
 from backend.scene import Camera, Region, SolvedCameras, no_progress, transform_points
 from backend.stages.region import RegionConfig, find_region, nearest_to_axes, weighted_quantile
 from tests.synthetic_scene import (
@@ -120,6 +123,29 @@ def test_masks_that_have_hardly_anything_in_common_are_told(cameras: list[Camera
     region_of(with_first_mask(lambda mask: np.roll(mask, mask.shape[1] // 20, axis=1)))
 
 
+def test_masks_of_narrow_bars_agree() -> None:
+    """A picture frame, whose bars fall between the middles of the hull's cells."""
+    bars = [
+        trimesh.creation.box(np.array(size) * SIZE, trimesh.transformations.translation_matrix(at))
+        for size, at in (
+            ((1.6, 0.04, 0.04), CENTRE + np.array([0, 0, 0.7]) * SIZE),
+            ((1.6, 0.04, 0.04), CENTRE - np.array([0, 0, 0.7]) * SIZE),
+            ((0.04, 0.04, 1.4), CENTRE + np.array([0.8, 0, 0]) * SIZE),
+            ((0.04, 0.04, 1.4), CENTRE - np.array([0.8, 0, 0]) * SIZE),
+        )
+    ]
+    frame = trimesh.util.concatenate(bars)
+    caster = RayCaster(np.asarray(frame.vertices), np.asarray(frame.faces, np.int64))
+    cameras = ring_cameras(8, 320)
+    masks = [caster.cast(*camera_rays(camera)).hit.reshape(camera.height, -1) for camera in cameras]
+    solved = photographed(cameras).solved()
+    views = zip(solved.views, masks, strict=True)
+    masked = replace(solved, views=tuple(replace(view, mask=mask.astype(np.float32)) for view, mask in views))
+    region = region_of(masked)
+    farthest = np.linalg.norm(frame.vertices - region.centre_world, axis=1).max()
+    assert 0.7 < farthest / region.radius_world <= 1
+
+
 def test_masks_in_conflict_are_told() -> None:
     """At the same height, rays through the top rows of one and the bottom rows of the other never meet."""
     first, _, second = photographed(arc_cameras(3, 30, 80)).views
@@ -177,6 +203,29 @@ def test_what_stands_behind_the_subject_for_one_camera_is_left_out() -> None:
     )
     np.testing.assert_allclose(both.centre_world, alone.centre_world, atol=0.02 * alone.radius_world)
     assert both.radius_world == pytest.approx(alone.radius_world, rel=0.02)
+
+
+def closer(camera: Camera, times: float, at: np.ndarray) -> Camera:
+    """The same picture of the place `at` alone, taken from as far away by a longer lens."""
+    (middle,), _ = projected(at[None], camera)
+    lens = {"fx_px": times * camera.fx_px, "fy_px": times * camera.fy_px}
+    aside = (np.array([camera.cx_px, camera.cy_px]) - middle) * times
+    centre = np.array([camera.width, camera.height]) / 2 + aside
+    return replace(camera, **lens, cx_px=float(centre[0]), cy_px=float(centre[1]))
+
+
+def test_close_ups_of_a_detail_do_not_shrink_the_region_to_it() -> None:
+    points = surface_samples(600)
+    detail = surface_points(np.array([[0.9, -0.42, 0.12]]) / np.linalg.norm([0.9, -0.42, 0.12]))[0]
+    overviews = arc_cameras(6, 120, 80)
+    close_ups = [closer(camera_at(azimuth, 0.6, 80), 6.0, detail) for azimuth in (25.0, 45.0, 65.0)]
+    found = {}
+    for cameras in (overviews, [*overviews, *close_ups]):
+        visibility = np.ones((len(points), len(cameras)), bool)
+        changes = {"sparse_positions": points, "sparse_visibility": visibility}
+        found[len(cameras)] = region_of(without_images(cameras, **changes))
+    assert found[9].radius_world == pytest.approx(found[6].radius_world, rel=0.05)
+    assert share_inside(found[9]) > 0.9
 
 
 def in_a_room(num_subject: int, num_room: int) -> SolvedCameras:
@@ -253,6 +302,17 @@ def test_a_given_sphere_is_taken() -> None:
     np.testing.assert_allclose(region.centre_world, [1, 2, 3])
     assert region.radius_world == pytest.approx(4.0)
     assert region.decisions[0].because == "set by the user"
+
+
+def test_a_given_sphere_that_no_photograph_shows_is_told() -> None:
+    config = RegionConfig(centre_world=tuple(CENTRE + np.array([0, 0, 200])), radius_world=3.0)
+    with pytest.raises(ReconstructionError, match="0 of 3 photographs") as raised:
+        region_of(photographed(arc_cameras(3, 40, 80)).solved(), config)
+    assert raised.value.code == ErrorCode.SETTINGS_INVALID
+    around = RegionConfig(centre_world=tuple(CENTRE), radius_world=30 * SIZE)  # all cameras stand in it
+    assert region_of(photographed(arc_cameras(3, 40, 80)).solved(), around).radius_world == pytest.approx(
+        30 * SIZE
+    )
 
 
 # the weighted quantile
