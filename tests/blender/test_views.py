@@ -498,6 +498,22 @@ def test_an_object_that_is_in_no_picture_says_why(cube: Any, tmp_path: Path) -> 
     assert state() == before
 
 
+def test_a_linked_object_of_the_same_name_is_another_one(cube: Any, tmp_path: Path) -> None:
+    bpy.data.libraries.write(str(tmp_path / "other.blend"), {cube}, fake_user=True)
+    with bpy.data.libraries.load(str(tmp_path / "other.blend"), link=True) as (_, wanted):
+        wanted.objects = ["Cube"]
+    (linked,) = wanted.objects
+    bpy.context.scene.collection.objects.link(linked)
+    cube.location = (3, 1, 5)
+    for made in (cube, linked):
+        generate(view_count=2, target=made.name_full)
+        assert bpy.context.scene.fewview.target == made
+        folder = rendered(tmp_path)
+        middle = true_surface(folder).positions.mean(axis=0)
+        assert middle == pytest.approx(tuple(made.location), abs=1e-5)
+        assert_pictures_show_the_truth(folder)
+
+
 def test_objects_behind_the_scene_are_not_in_the_mask(cube: Any, tmp_path: Path) -> None:
     generate(view_count=2, target="Cube")
     floor = bpy.data.objects["Floor"]
