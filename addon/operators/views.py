@@ -179,8 +179,8 @@ class FEWVIEW_OT_render_views(bpy.types.Operator):
         )
 
     def _start(self, scene: bpy.types.Scene, request: ViewRequest, folder: Path) -> None:
-        if unsaved := render_worker.unsaved_images():
-            self.report({"WARNING"}, f"Rendered as they were last saved: {', '.join(unsaved)}")
+        for sentence in render_worker.not_copied(scene, request):
+            self.report({"WARNING"}, sentence)
         render_worker.prepare(scene, request, folder)
         scene_uid = scene.session_uid
         jobs.start(

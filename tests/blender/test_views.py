@@ -853,6 +853,47 @@ def test_a_second_blender_renders_what_is_not_saved(
     assert {path: path.read_bytes() for path in before} == before
 
 
+def test_a_second_blender_has_what_was_simulated(
+    cube: Any, second_blender: ModuleType, tmp_path: Path
+) -> None:
+    """Neither the frames of a cloth nor where it lies are to be had without them."""
+    scene = bpy.context.scene
+    bpy.ops.mesh.primitive_grid_add(x_subdivisions=4, y_subdivisions=4, location=(3, 1, 3))
+    cloth = bpy.context.object
+    cloth.modifiers.new("Cloth", "CLOTH").point_cache.frame_end = 12
+    for frame in range(1, 13):
+        scene.frame_set(frame)
+    fallen = cloth.evaluated_get(bpy.context.evaluated_depsgraph_get()).data.vertices[0].co.z
+    assert fallen < -0.3
+    generate(view_count=2, target=cloth.name)
+    folder = rendered(tmp_path, target=cloth.name)
+    lowest = true_surface(folder).positions[:, 2].min()
+    assert lowest == pytest.approx(3 + fallen, abs=0.01)
+    assert bpy.data.filepath == ""
+    assert not (folder / second_blender.COPY).exists()
+
+
+def test_what_a_second_blender_lacks_is_said(
+    cube: Any, second_blender: ModuleType, rendering: ModuleType, tmp_path: Path
+) -> None:
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "own.blend"))  # else there is no cache on disk
+    scene = bpy.context.scene
+    wanted = request(rendering, views=(rendering.View(camera=""), rendering.View(camera="", frame=5)))
+    assert second_blender.not_copied(scene, wanted) == ()
+    image = bpy.data.images.new("painted", 2, 2)
+    image.pixels = [0.0] * 16
+    image.pack()
+    assert second_blender.not_copied(scene, wanted) == ()
+    image.pixels = [1.0] * 16
+    cube.modifiers.new("Cloth", "CLOTH").point_cache.use_disk_cache = True
+    assert second_blender.not_copied(scene, wanted) == (
+        "Rendered as they were last saved or packed: painted",
+        "Rendered without what is simulated in a cache on disk: Cube",
+    )
+    first = request(rendering, views=(rendering.View(camera=""),))  # where nothing is simulated yet
+    assert len(second_blender.not_copied(scene, first)) == 1
+
+
 def test_an_error_in_the_second_blender_reaches_the_first(
     cube: Any, second_blender: ModuleType, tmp_path: Path
 ) -> None:
