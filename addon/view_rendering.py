@@ -213,7 +213,8 @@ def _same_frame(scene: bpy.types.Scene) -> Iterator[None]:
     try:
         yield
     finally:
-        scene.frame_set(frame, subframe=subframe)
+        if (scene.frame_current, scene.frame_subframe) != (frame, subframe):
+            scene.frame_set(frame, subframe=subframe)
         scene.camera = camera
         for made, name, value in places:
             if tuple(getattr(made, name)) != value:
