@@ -53,16 +53,8 @@ def subject_of(target: Any) -> tuple[Any, ...]:
 
 def rendered_objects(view_layer: Any) -> set[Any]:
     """What renders of the view layer show, whether the viewport does or not."""
-    found: set[Any] = set()
-    waiting = [view_layer.layer_collection]
-    while waiting:
-        layer = waiting.pop()
-        if layer.collection.hide_render:
-            continue
-        waiting.extend(layer.children)
-        if not layer.exclude:
-            found.update(made for made in layer.collection.objects if not made.hide_render)
-    return found
+    layers = (layer for layer in _rendered_layers(view_layer) if not layer.exclude)
+    return {made for layer in layers for made in layer.collection.objects if not made.hide_render}
 
 
 @contextmanager
@@ -70,12 +62,19 @@ def as_rendered(objects: tuple[Any, ...]) -> Iterator[None]:
     """Let the viewport have these objects, and what they are instances of, as renders do."""
     collections = _instanced_collections(objects)
     inside = {made for collection in collections for made in collection.objects}
-    shown = [(made, "hide_viewport", False) for made in objects]
+    around = [
+        owner
+        for layer in _rendered_layers(bpy.context.view_layer)
+        if not set(objects).isdisjoint(layer.collection.all_objects)
+        for owner in (layer, layer.collection)
+    ]
+    shown = [(owner, "hide_viewport", False) for owner in (*objects, *around)]
     shown += [(part, "hide_viewport", part.hide_render) for part in (*collections, *inside)]
     first = _differing([*shown, *_as_in_renders({bpy.context.scene.render, *objects, *inside})])
-    # Only after the first changes modifiers make all the instances that they make in renders.
-    with changed(first), changed(_differing(_as_in_renders(_instanced(objects) - inside))):
-        yield
+    with _unhidden(objects), changed(first):
+        others = _instanced(objects) - inside  # only now modifiers make all that they make in renders
+        with changed(_differing(_as_in_renders(others))):
+            yield
 
 
 def instanced_by(objects: tuple[Any, ...]) -> set[Any]:
@@ -91,6 +90,29 @@ def true_mesh(objects: tuple[Any, ...]) -> TrueMesh:
     """
     with as_rendered(objects):
         return _viewport_mesh(objects)
+
+
+def _rendered_layers(view_layer: Any) -> Iterator[Any]:
+    """Layer collections that are not hidden from renders; those that are excluded among them."""
+    waiting = [view_layer.layer_collection]
+    while waiting:
+        layer = waiting.pop()
+        if not layer.collection.hide_render:
+            yield layer
+            waiting.extend(layer.children)
+
+
+@contextmanager
+def _unhidden(objects: tuple[Any, ...]) -> Iterator[None]:
+    """Without the closed eyes of the outliner, which renders do not look at."""
+    hidden = [made for made in objects if made.hide_get()]
+    for made in hidden:
+        made.hide_set(False)
+    try:
+        yield
+    finally:
+        for made in hidden:
+            made.hide_set(True)
 
 
 def _instanced_collections(objects: Iterable[Any]) -> set[Any]:

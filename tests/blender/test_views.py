@@ -405,9 +405,23 @@ def hide_in_viewport(part: Any) -> None:
     part.hide_viewport = True
 
 
+def close_eye(part: Any) -> None:
+    part.hide_set(True)
+
+
+def hide_collection_in_viewport(part: Any) -> None:
+    hide_collection_in_renders(part)
+    layer = bpy.context.view_layer.layer_collection.children["cutters"]
+    layer.collection.hide_render = False
+    layer.hide_viewport = layer.collection.hide_viewport = True
+
+
 @pytest.mark.parametrize(
     ("hide", "size"),
-    [(hide_in_renders, 1.0), (hide_collection_in_renders, 1.0), (hide_in_viewport, 2.0)],
+    [
+        *((hide_in_renders, 1.0), (hide_collection_in_renders, 1.0)),
+        *((hide_in_viewport, 2.0), (close_eye, 2.0), (hide_collection_in_viewport, 2.0)),
+    ],
 )
 def test_children_are_part_of_the_subject_where_renders_show_them(
     cube: Any, tmp_path: Path, hide: Callable[[Any], None], size: float
@@ -423,6 +437,7 @@ def test_children_are_part_of_the_subject_where_renders_show_them(
     assert np.ptp(true_surface(folder).positions, axis=0) == pytest.approx([size] * 3)
     assert_pictures_show_the_truth(folder)
     assert state() == before
+    assert child.hide_get() == (hide == close_eye)
 
 
 def test_modifiers_of_renders_are_framed_and_measured(cube: Any, tmp_path: Path) -> None:
