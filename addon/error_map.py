@@ -88,7 +88,7 @@ def _truth(result_uid: int, truth_uids: Sequence[int]) -> TrueMesh:
         return true_mesh(tuple(dict.fromkeys(subjects)))
     except ValueError as error:
         names = ", ".join(made.name for made in subjects)
-        raise ValueError(f"{names} cannot be measured against, {error}: show it in the viewport") from error
+        raise ValueError(f"{names} cannot be measured against: {error}") from error
 
 
 def _object(uid: int) -> bpy.types.Object:

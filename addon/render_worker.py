@@ -8,7 +8,7 @@ import platform
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import closing
 from pathlib import Path
 
@@ -45,14 +45,49 @@ def needs_waiting() -> bool:
 def prepare(scene: bpy.types.Scene, request: ViewRequest, folder: Path) -> None:
     """Write what the second Blender reads: the request, and the scene with all that it uses.
 
-    Not by saving a copy of the file, which takes longer and runs the user's handlers.
+    Not by saving a copy of the file, which takes longer and runs the user's handlers; but where there are
+    simulations, whose frames are in nothing else.
     Raises RuntimeError or OSError where the copy cannot be written.
     """
     (folder / REQUEST).write_text(encode_request(request), encoding="utf-8")
     if bpy.ops.ed.flush_edits.poll():
         bpy.ops.ed.flush_edits()  # what is being edited or sculpted
+    copy = str(folder / COPY)
+    if any(_simulations(scene, request)):
+        bpy.ops.wm.save_as_mainfile(filepath=copy, copy=True, compress=False, check_existing=False)
+        return
     blocks = {scene, *bpy.data.texts}  # drivers may call what a text defines
-    bpy.data.libraries.write(str(folder / COPY), blocks, path_remap="ABSOLUTE", compress=False)
+    bpy.data.libraries.write(copy, blocks, path_remap="ABSOLUTE", compress=False)
+
+
+def not_copied(scene: bpy.types.Scene, request: ViewRequest) -> tuple[str, ...]:
+    """What the second Blender has not, or not as it is here, in sentences for the user."""
+    painted = [image.name for image in bpy.data.images if image.is_dirty]
+    on_disk = [name for name, cache in _simulations(scene, request) if cache.use_disk_cache]
+    sentences = {
+        "Rendered as they were last saved or packed": painted,
+        "Rendered without what is simulated in a cache on disk": on_disk,
+    }
+    return tuple(f"{what}: {', '.join(dict.fromkeys(names))}" for what, names in sentences.items() if names)
+
+
+def _simulations(scene: bpy.types.Scene, request: ViewRequest) -> Iterator[tuple[str, bpy.types.PointCache]]:
+    """Names of objects, and what was simulated of them before the frames of the views."""
+    last = max(scene.frame_current if view.frame is None else view.frame for view in request.views)
+    for made in scene.objects:
+        yield from ((made.name, cache) for cache in _point_caches(made) if cache.frame_start < last)
+
+
+def _point_caches(made: bpy.types.Object) -> Iterator[bpy.types.PointCache]:
+    for modifier in made.modifiers:
+        if hasattr(modifier, "point_cache"):  # cloth and soft bodies
+            yield modifier.point_cache
+        canvas = getattr(modifier, "canvas_settings", None)
+        if canvas is not None:
+            yield from (surface.point_cache for surface in canvas.canvas_surfaces)
+    for system in made.particle_systems:
+        if system.settings.type != "HAIR" or system.use_hair_dynamics:
+            yield system.point_cache
 
 
 def clean(folder: Path) -> None:
@@ -75,11 +110,6 @@ def render_here(request: ViewRequest, folder: Path) -> None:
     with closing(render_views(request, folder)) as views:
         for index, _ in views:
             sys.stderr.write(f"FewView: {_view_of(index + 1, request)}\n")
-
-
-def unsaved_images() -> tuple[str, ...]:
-    """Painted images that are nowhere but in this Blender's memory: a copy of the file does not have them."""
-    return tuple(image.name for image in bpy.data.images if image.is_dirty and image.packed_file is None)
 
 
 def main(folder: str) -> None:

@@ -153,6 +153,8 @@ def _selected_alone(context: bpy.types.Context, result: bpy.types.Object) -> Ite
         for made in before:
             made.select_set(False, view_layer=view_layer)
         result.select_set(True, view_layer=view_layer)
+        if not result.select_get(view_layer=view_layer):
+            raise ValueError(f"{result.name} cannot be selected: make it selectable first")
         view_layer.objects.active = result
         yield
     finally:

@@ -21,4 +21,13 @@ def scene_name_of(uid: int) -> str:
 
 def in_scene(scene: bpy.types.Scene, made: bpy.types.Object | None) -> bpy.types.Object | None:
     """The object of a setting; None where it was deleted: the setting keeps it alive, out of the scene."""
-    return made if made is not None and scene.objects.get(made.name) == made else None
+    found = None if made is None else scene.objects.get(made.name)
+    if found is None or found == made:
+        return found
+    # Of several with one name, some of them linked from other files, the look-up gives the first.
+    return next((other for other in scene.objects if other == made), None)
+
+
+def object_named(scene: bpy.types.Scene, name: str) -> bpy.types.Object | None:
+    """The object of this full name, or else name: of several with one name that of no other file."""
+    return next((made for made in scene.objects if made.name_full == name), scene.objects.get(name))

@@ -13,16 +13,21 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import bpy
+import numpy as np
 
 from .camera_lens import pinhole_of, world_from_camera
 from .kept_settings import Change, changed
 from .png import critical_chunks
 from .solved import SolvedCamera, write_cameras
-from .true_mesh import TrueMesh, subject_of, true_mesh, write_ply
+from .true_mesh import TrueMesh, instanced_by, rendered_objects, subject_of, true_mesh, write_ply
 
 IMAGES, TRANSFORMS, TRUTH = "images", "transforms.json", "truth.ply"
 ENGINES = {"CYCLES": "CYCLES", "WORKBENCH": "BLENDER_WORKBENCH"}
 """Blender's ids; any other name means the scene's own engine."""
+PENCILS = {"GREASEPENCIL", "GPENCIL"}
+"""Type of the objects of Grease Pencil, from Blender 4.3 on and before."""
+PLACE = ("location", "rotation_euler", "rotation_quaternion", "rotation_axis_angle", "scale")
+"""What moves an object; which rotation counts is a choice of the object."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -80,22 +85,27 @@ def render_views(request: ViewRequest, folder: Path) -> Generator[tuple[int, Pat
     cameras = [_object(scene, view.camera) for view in request.views if view.camera]
     (folder / IMAGES).mkdir(parents=True)
     taken: list[SolvedCamera] = []
-    engine = ENGINES.get(request.engine, scene.render.engine)
+    is_seen = False
     changes = (
+        *_marker_changes(scene, request),
         *render_changes(scene, request),
         *camera_changes(scene, cameras),
-        *_mask_changes(scene, subject, engine),
-        *_surface_changes(subject),
     )
-    with _same_frame(scene, request), changed(changes):
-        for index, view in enumerate(request.views):
-            _go_to(scene, view)
-            if index == 0 and subject:
-                truth = _truth(subject)
-            path = folder / IMAGES / f"{index:03d}.png"
-            taken.append(_take(scene, path, noise_seed=index))
-            yield index, path
-    if subject:
+    with _same_frame(scene), changed(changes):
+        _go_to(scene, request.views[0])
+        truth = _truth(subject) if subject else None
+        masked = _mask_changes(scene, subject, scene.render.engine)
+        with changed(masked):
+            for index, view in enumerate(request.views):
+                _go_to(scene, view)
+                _check(masked)
+                path = folder / IMAGES / f"{index:03d}.png"
+                taken.append(_take(scene, path, noise_seed=index))
+                is_seen = is_seen or _shows_something(path)
+                yield index, path
+    if truth is not None:
+        if not is_seen:
+            raise ValueError(f"{request.target} is in no picture: is it hidden from cameras?")
         write_ply(folder / TRUTH, truth)
     write_cameras(folder / TRANSFORMS, taken)
 
@@ -152,51 +162,73 @@ def camera_changes(scene: bpy.types.Scene, cameras: Iterable[bpy.types.Object]) 
     return tuple((data.dof, "use_dof", False) for data in everyone if isinstance(data, bpy.types.Camera))
 
 
+def _marker_changes(scene: bpy.types.Scene, request: ViewRequest) -> tuple[Change, ...]:
+    """Markers that are bound to cameras would change a view's own camera whenever it is rendered."""
+    if not all(view.camera for view in request.views):
+        return ()
+    return tuple((marker, "camera", None) for marker in scene.timeline_markers if marker.camera)
+
+
 def _mask_changes(
     scene: bpy.types.Scene, subject: tuple[bpy.types.Object, ...], engine: str
 ) -> tuple[Change, ...]:
     """What is not the subject lights it and is reflected in it, but is no part of the picture's alpha."""
     if not subject:
         return ()
-    instanced = {part for made in subject for part in _instanced(made)}
-    others = [made for made in scene.objects if made not in subject and made not in instanced]
-    if engine == ENGINES["WORKBENCH"]:  # it has neither light nor rays
-        return tuple((made, "hide_render", True) for made in others)
-    return tuple((made, "visible_camera", False) for made in others)
+    kept = {*subject, *instanced_by(subject)}  # hiding what it is made of would hide it
+    others = [made for made in _all_objects(scene) if made not in kept]
+    # Workbench has neither light nor rays, and pencils are drawn over the picture without any.
+    return tuple(
+        (made, "hide_render", True)
+        if engine == ENGINES["WORKBENCH"] or made.type in PENCILS
+        else (made, "visible_camera", False)
+        for made in others
+    )
 
 
-def _instanced(made: bpy.types.Object) -> tuple[bpy.types.Object, ...]:
-    """Objects that appear as part of this one: hiding them from the camera would hide it."""
-    collection = made.instance_collection if made.instance_type == "COLLECTION" else None
-    if collection is None:
-        return ()
-    parts = tuple(collection.all_objects)
-    return (*parts, *(inner for part in parts for inner in _instanced(part)))
+def _all_objects(scene: bpy.types.Scene) -> Iterator[bpy.types.Object]:
+    """Also those of the scenes that are rendered behind this one."""
+    shown: bpy.types.Scene | None = scene
+    while shown is not None:
+        yield from shown.objects
+        shown = shown.background_set
 
 
-def _surface_changes(subject: tuple[bpy.types.Object, ...]) -> tuple[Change, ...]:
-    """The true mesh is read as the viewport has it: let that be what is rendered."""
-    modifiers = [modifier for made in subject for modifier in made.modifiers]
-    shown = [(m, "show_viewport", m.show_render) for m in modifiers]
-    levels = [(m, "levels", m.render_levels) for m in modifiers if m.type in {"SUBSURF", "MULTIRES"}]
-    return (*shown, *levels)
+def _check(masked: Iterable[Change]) -> None:
+    """Raise ValueError where keys or a driver show what is to be no part of the picture."""
+    for made, name, value in masked:
+        if getattr(made, name) != value:
+            label = made.bl_rna.properties[name].name
+            raise ValueError(
+                f"{made.name} would be in the mask: its '{label}' has keys or a driver; remove them, or "
+                "render without an object"
+            )
 
 
 @contextmanager
-def _same_frame(scene: bpy.types.Scene, request: ViewRequest) -> Iterator[None]:
-    """Return to the frame that was shown, and its camera, where any view goes to another."""
+def _same_frame(scene: bpy.types.Scene) -> Iterator[None]:
+    """Return to the frame that was shown, to its camera, and to what was moved there without a key."""
     frame, subframe, camera = scene.frame_current, scene.frame_subframe, scene.camera
+    places = [(made, name, tuple(getattr(made, name))) for made in scene.objects for name in PLACE]
     try:
         yield
     finally:
-        if any(view.frame is not None for view in request.views):
+        if (scene.frame_current, scene.frame_subframe) != (frame, subframe):
             scene.frame_set(frame, subframe=subframe)
-            scene.camera = camera
+        scene.camera = camera
+        for made, name, value in places:
+            if tuple(getattr(made, name)) != value:
+                setattr(made, name, value)
 
 
 def _go_to(scene: bpy.types.Scene, view: View) -> None:
-    """Show the view's frame through the view's camera."""
-    if view.frame is not None:
+    """Show the view's frame through the view's camera, with all that has keys where these say.
+
+    Also where the frame is shown already: rendering goes by the keys, not by what was moved since.
+    """
+    if view.frame is None:
+        scene.frame_set(scene.frame_current, subframe=scene.frame_subframe)
+    else:
         scene.frame_set(view.frame)  # a marker may change the scene's camera here
     if view.camera:
         scene.camera = _object(scene, view.camera)
@@ -221,6 +253,16 @@ def _take(scene: bpy.types.Scene, path: Path, *, noise_seed: int) -> SolvedCamer
     return SolvedCamera(name=f"{IMAGES}/{path.name}", world_from_camera=pose, pinhole=pinhole)
 
 
+def _shows_something(path: Path) -> bool:
+    image = bpy.data.images.load(str(path))
+    try:
+        values = np.empty(len(image.pixels), np.float32)
+        image.pixels.foreach_get(values)
+    finally:
+        bpy.data.images.remove(image)
+    return bool(values[3::4].any())
+
+
 def _object(scene: bpy.types.Scene, full_name: str) -> bpy.types.Object:
     found = next((made for made in scene.objects if made.name_full == full_name), None)
     if found is None:
@@ -231,6 +273,8 @@ def _object(scene: bpy.types.Scene, full_name: str) -> bpy.types.Object:
 def _subject(target: bpy.types.Object) -> tuple[bpy.types.Object, ...]:
     if target.hide_render:
         raise ValueError(f"{target.name} is hidden from renders: show it, or choose another object")
+    if target not in rendered_objects(bpy.context.view_layer):
+        raise ValueError(f"{target.name} is in no picture: is its collection hidden from renders?")
     return subject_of(target)
 
 

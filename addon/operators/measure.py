@@ -8,6 +8,7 @@ from bpy.props import StringProperty
 from .. import colours
 from ..error_map import measure_steps
 from ..properties import settings_of
+from ..scenes import object_named
 from .on_result import OnResult, Status, refused, result_of
 
 _TICK_S = 0.01
@@ -69,12 +70,12 @@ class FEWVIEW_OT_measure_error(OnResult, bpy.types.Operator):
         target = settings_of(context).target
         if not self.truth:
             return [] if target is None else [target]
-        objects = context.scene.objects
-        names = [self.truth] if self.truth in objects else [name.strip() for name in self.truth.split(",")]
-        missing = [name for name in names if name not in objects]
-        if missing:
+        whole = object_named(context.scene, self.truth)  # its name may have a comma
+        names = [self.truth] if whole else [name.strip() for name in self.truth.split(",")]
+        found = {name: object_named(context.scene, name) for name in names}
+        if missing := [name for name, made in found.items() if made is None]:
             raise ValueError(f"There is no object {', '.join(missing)} in this scene")
-        return [objects[name] for name in names]
+        return [made for made in found.values() if made is not None]
 
     def _finished(self, context: bpy.types.Context, end: StopIteration) -> Status:
         self.report({"INFO"}, end.value.text)

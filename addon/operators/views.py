@@ -14,7 +14,7 @@ from ..arguments import argument, fill_in
 from ..camera_objects import selected_cameras
 from ..job_folder import new_folder
 from ..properties import FEWVIEW_PG_settings, settings_of
-from ..scenes import in_scene, scene_name_of, scene_named
+from ..scenes import in_scene, object_named, scene_name_of, scene_named
 from ..solved import read_solved
 from ..true_mesh import WITH_SURFACE
 from ..view_cameras import ViewPlan
@@ -179,8 +179,8 @@ class FEWVIEW_OT_render_views(bpy.types.Operator):
         )
 
     def _start(self, scene: bpy.types.Scene, request: ViewRequest, folder: Path) -> None:
-        if unsaved := render_worker.unsaved_images():
-            self.report({"WARNING"}, f"Rendered as they were last saved: {', '.join(unsaved)}")
+        for sentence in render_worker.not_copied(scene, request):
+            self.report({"WARNING"}, sentence)
         render_worker.prepare(scene, request, folder)
         scene_uid = scene.session_uid
         jobs.start(
@@ -222,7 +222,7 @@ def _target(context: bpy.types.Context, operator: bpy.types.Operator) -> bpy.typ
         return in_scene(context.scene, settings_of(context).target)
     if not operator.target:
         return None
-    found = context.scene.objects.get(operator.target)
+    found = object_named(context.scene, operator.target)
     if found is None:
         raise ValueError(f"There is no object {operator.target} in the scene")
     return found

@@ -378,6 +378,18 @@ def test_it_is_around_the_subject_of_new_views(
     assert settings.root is None
 
 
+def test_it_is_around_what_renders_show_of_the_object(part: Part) -> None:
+    scene = bpy.context.scene
+    add_cube(0)
+    radius = part("region").guess(scene)[0][1]
+    array = scene.fewview.target.modifiers.new("Array", "ARRAY")
+    array.count, array.show_viewport = 5, False
+    (centre, larger), _ = part("region").guess(scene)
+    assert larger > 2 * radius
+    assert centre[0] == pytest.approx(4)
+    assert not array.show_viewport
+
+
 def test_a_deleted_region_asks_for_no_cameras(
     reconstruct: Callable[[], Any], part: Part, tmp_path: Path
 ) -> None:

@@ -686,6 +686,21 @@ def test_the_error_is_that_of_the_world(result: object, parts: SimpleNamespace) 
     assert numbers.median_percent == pytest.approx(100 * 0.05 / diagonal, rel=0.05)
 
 
+def test_the_error_is_to_what_renders_show(result: object, parts: SimpleNamespace) -> None:
+    """An exact copy of the rendered surface has none, whatever of it the viewport shows."""
+    bpy.ops.mesh.primitive_cube_add()
+    truth = bpy.context.object
+    subdivision = truth.modifiers.new("Subdivision", "SUBSURF")
+    subdivision.levels, subdivision.render_levels = 3, 3
+    bpy.context.view_layer.update()
+    exact = truth.evaluated_get(bpy.context.evaluated_depsgraph_get())
+    result.data = bpy.data.meshes.new_from_object(exact)
+    subdivision.levels, truth.hide_viewport = 1, True
+    bpy.ops.fewview.measure_error(truth=truth.name, object_name=result.name)
+    assert parts.error_map.numbers_of(result).p90_percent < 1e-4
+    assert (subdivision.levels, truth.hide_viewport) == (1, True)
+
+
 def test_distances_agree_with_a_plain_search(parts: SimpleNamespace, result: object) -> None:
     """Many trees find what one tree finds, for points far and near."""
     from mathutils.bvhtree import BVHTree
@@ -808,6 +823,18 @@ def test_the_file_browser_knows_the_whole_name(parts: SimpleNamespace) -> None:
         asked = SimpleNamespace(filepath=typed, format=".ply")
         assert check(asked, bpy.context) is (typed != whole)
         assert asked.filepath == whole
+
+
+def test_what_cannot_be_selected_is_not_exported_as_nothing(result: object, tmp_path: Path) -> None:
+    result.hide_select = True
+    bpy.ops.mesh.primitive_cube_add()
+    other = bpy.context.object
+    for ending in ("glb", "ply", "obj", "stl"):
+        with pytest.raises(RuntimeError, match="cannot be selected: make it selectable first"):
+            bpy.ops.fewview.export(filepath=str(tmp_path / f"mesh.{ending}"), object_name=result.name)
+    assert not list(tmp_path.glob("mesh.*"))
+    assert bpy.context.selected_objects == [other]
+    assert bpy.context.view_layer.objects.active == other
 
 
 def test_export_replaces_no_materials_of_another_thing(result: object, tmp_path: Path) -> None:

@@ -30,6 +30,7 @@ def rendering(addon: ModuleType) -> ModuleType:
 @pytest.fixture
 def cube(addon: ModuleType) -> Any:
     """A cube of 1 m beside the origin, on a floor, under a lamp."""
+    bpy.context.scene.render.image_settings.file_format = "PNG"  # fills in what is empty before the first
     bpy.ops.mesh.primitive_plane_add(size=20.0, location=(0, 0, -0.5))
     bpy.context.object.name = "Floor"
     bpy.ops.object.light_add(type="SUN")
@@ -285,6 +286,280 @@ def test_workbench_masks_too(cube: Any, tmp_path: Path, rendering: ModuleType) -
         ("Floor", "hide_render", True),
         ("Sun", "hide_render", True),
     }
+
+
+# Pictures, masks and the true surface are of the same things
+
+
+def true_surface(folder: Path) -> Any:
+    ply = importlib.import_module("bl_ext.user_default.fewview.addon.ply")
+    return ply.read_ply(folder / "truth.ply")
+
+
+def rendered(output: Path, **arguments: Any) -> Path:
+    """Folder of new views of a tiny size."""
+    assert bpy.ops.fewview.render_views(output=str(output), **{**SMALL, **arguments}) == {"FINISHED"}
+    return max(output.glob("views-*"))
+
+
+def assert_pictures_show_the_truth(folder: Path) -> None:
+    """The outline in each mask is that of the true surface, by the file's cameras, and whole."""
+    points = true_surface(folder).positions
+    for frame in transforms(folder):
+        rows, columns = np.nonzero(pixels_rgba(folder / frame["file_path"])[..., 3] > 0.5)
+        seen = np.array([projected(frame, point) for point in points])
+        assert seen.min() > 0
+        assert (seen.max(axis=0) < (64, 48)).all()
+        edges = [columns.min(), rows.min(), columns.max() + 1, rows.max() + 1]
+        np.testing.assert_allclose(edges, [*seen.min(axis=0), *seen.max(axis=0)], atol=1.5)
+
+
+def add_camera(name: str, distance: float) -> Any:
+    """It looks at the cube from the front."""
+    camera = bpy.data.objects.new(name, bpy.data.cameras.new(name))
+    bpy.context.scene.collection.objects.link(camera)
+    camera.location, camera.rotation_euler = (3, 1 - distance, 0), (np.pi / 2, 0, 0)
+    bpy.context.view_layer.update()
+    return camera
+
+
+def add_cube(name: str, size: float, location: tuple[float, float, float]) -> Any:
+    bpy.ops.mesh.primitive_cube_add(size=size, location=location)
+    bpy.context.object.name = name
+    return bpy.context.object
+
+
+def scatter(carrier: Any, scattered: Any) -> None:
+    """Geometry Nodes add the object at each of the vertices."""
+    tree = bpy.data.node_groups.new("scatter", "GeometryNodeTree")
+    for way in ("INPUT", "OUTPUT"):
+        tree.interface.new_socket("Geometry", in_out=way, socket_type="NodeSocketGeometry")
+    kinds = ("NodeGroupInput", "GeometryNodeInstanceOnPoints", "GeometryNodeJoinGeometry", "NodeGroupOutput")
+    came, placed, joined, goes = (tree.nodes.new(kind) for kind in kinds)
+    info = tree.nodes.new("GeometryNodeObjectInfo")
+    info.inputs["Object"].default_value, info.inputs["As Instance"].default_value = scattered, True
+    for start, end in (
+        (came.outputs[0], placed.inputs["Points"]),
+        (info.outputs["Geometry"], placed.inputs["Instance"]),
+        (came.outputs[0], joined.inputs[0]),
+        (placed.outputs[0], joined.inputs[0]),
+        (joined.outputs[0], goes.inputs[0]),
+    ):
+        tree.links.new(start, end)
+    carrier.modifiers.new("Scatter", "NODES").node_group = tree
+
+
+def scatter_particles(carrier: Any, scattered: Any) -> None:
+    carrier.modifiers.new("Particles", "PARTICLE_SYSTEM")
+    settings = carrier.particle_systems[0].settings
+    settings.type, settings.count, settings.render_type = "HAIR", 30, "OBJECT"
+    settings.instance_object, settings.particle_size = scattered, 0.5
+    settings.display_percentage = 10
+
+
+def test_a_marker_with_a_camera_does_not_take_the_pictures(cube: Any, tmp_path: Path) -> None:
+    scene = bpy.context.scene
+    own, far = generate(view_count=2)[0], add_camera("far", 30)
+    marker = scene.timeline_markers.new("cut", frame=1)
+    marker.camera, scene.camera = far, own  # in this order: the first changes the scene's too
+    assert_pictures_show_the_truth(rendered(tmp_path, target="Cube"))
+    assert (marker.camera, scene.camera) == (far, own)
+
+
+def test_what_was_moved_without_a_key_is_rendered_where_it_is_said_to_be(cube: Any, tmp_path: Path) -> None:
+    """And stands afterwards where it was moved to."""
+    camera = generate(view_count=2)[0]
+    camera.keyframe_insert("location", frame=1)
+    cube.keyframe_insert("location", frame=1)
+    camera.location, cube.location = camera.location * 1.1, (3.1, 1, 0.1)
+    before = state()
+    assert_pictures_show_the_truth(rendered(tmp_path, target="Cube"))
+    assert state() == before
+
+
+@pytest.mark.parametrize("scattering", [scatter, scatter_particles])
+def test_what_is_scattered_over_the_subject_is_part_of_it(
+    cube: Any, tmp_path: Path, scattering: Callable[[Any, Any], None]
+) -> None:
+    scattering(cube, add_cube("Rock", 0.4, (60, 0, 0)))
+    generate(view_count=2, target="Cube")
+    folder = rendered(tmp_path, target="Cube")
+    assert np.ptp(true_surface(folder).positions, axis=0).min() > 1.1
+    assert_pictures_show_the_truth(folder)
+
+
+def hide_in_renders(part: Any) -> None:
+    part.hide_render = True
+
+
+def hide_collection_in_renders(part: Any) -> None:
+    collection = bpy.data.collections.new("cutters")
+    bpy.context.scene.collection.children.link(collection)
+    for other in part.users_collection:
+        other.objects.unlink(part)
+    collection.objects.link(part)
+    collection.hide_render = True
+
+
+def hide_in_viewport(part: Any) -> None:
+    part.hide_viewport = True
+
+
+def close_eye(part: Any) -> None:
+    part.hide_set(True)
+
+
+def hide_collection_in_viewport(part: Any) -> None:
+    hide_collection_in_renders(part)
+    layer = bpy.context.view_layer.layer_collection.children["cutters"]
+    layer.collection.hide_render = False
+    layer.hide_viewport = layer.collection.hide_viewport = True
+
+
+@pytest.mark.parametrize(
+    ("hide", "size"),
+    [
+        *((hide_in_renders, 1.0), (hide_collection_in_renders, 1.0)),
+        *((hide_in_viewport, 2.0), (close_eye, 2.0), (hide_collection_in_viewport, 2.0)),
+    ],
+)
+def test_children_are_part_of_the_subject_where_renders_show_them(
+    cube: Any, tmp_path: Path, hide: Callable[[Any], None], size: float
+) -> None:
+    """As a cutter is not, though the viewport shows it."""
+    child = add_cube("Child", 2.0, (0, 0, 0))
+    child.parent = cube
+    hide(child)
+    generate(view_count=2, target="Cube")
+    child.select_set(True)
+    before = state()
+    folder = rendered(tmp_path, target="Cube")
+    assert np.ptp(true_surface(folder).positions, axis=0) == pytest.approx([size] * 3)
+    assert_pictures_show_the_truth(folder)
+    assert state() == before
+    assert child.hide_get() == (hide == close_eye)
+
+
+def test_modifiers_of_renders_are_framed_and_measured(cube: Any, tmp_path: Path) -> None:
+    array = cube.modifiers.new("Array", "ARRAY")
+    array.count, array.show_viewport = 6, False
+    generate(view_count=2, target="Cube")
+    assert_pictures_show_the_truth(rendered(tmp_path, target="Cube"))
+    assert not array.show_viewport
+
+
+def test_an_instance_has_the_modifiers_of_renders(cube: Any, tmp_path: Path) -> None:
+    """Of the empty's collection: a part that renders hide, and one that the viewport hides."""
+    collection = bpy.data.collections.new("inside")
+    for index, name in enumerate(("shown", "cutter")):
+        part = add_cube(name, 1.0 + index, (0, 0, 0))
+        bpy.context.scene.collection.objects.unlink(part)
+        collection.objects.link(part)
+        part.hide_viewport, part.hide_render = name == "shown", name == "cutter"
+    array = collection.objects["shown"].modifiers.new("Array", "ARRAY")
+    array.count, array.show_viewport = 3, False
+    empty = bpy.data.objects.new("Instance", None)
+    empty.instance_type, empty.instance_collection = "COLLECTION", collection
+    bpy.context.scene.collection.objects.link(empty)
+    generate(view_count=2, target="Instance")
+    folder = rendered(tmp_path, target="Instance")
+    assert np.ptp(true_surface(folder).positions, axis=0) == pytest.approx([3, 1, 1])
+    assert_pictures_show_the_truth(folder)
+    hidden = [(part.hide_viewport, part.hide_render) for part in collection.objects]
+    assert hidden == [(True, False), (False, True)]
+
+
+def test_the_truth_is_as_simplified_as_renders(cube: Any, tmp_path: Path) -> None:
+    subdivision = cube.modifiers.new("Subdivision", "SUBSURF")
+    subdivision.levels, subdivision.render_levels = 1, 3
+    render = bpy.context.scene.render
+    render.use_simplify, render.simplify_subdivision, render.simplify_subdivision_render = True, 0, 2
+    generate(view_count=2, target="Cube")
+    folder = rendered(tmp_path, target="Cube")
+    assert len(true_surface(folder).positions) == 98
+    assert (render.simplify_subdivision, subdivision.levels) == (0, 1)
+
+
+@pytest.mark.parametrize("kind", ["CURVE", "FONT", "META"])
+def test_curves_are_in_the_truth_once(cube: Any, part: Callable[[str], ModuleType], kind: str) -> None:
+    if kind == "CURVE":
+        bpy.ops.curve.primitive_bezier_circle_add()
+        bpy.context.object.data.bevel_depth = 0.1
+    elif kind == "FONT":
+        bpy.ops.object.text_add()
+        bpy.context.object.data.extrude = 0.1
+    else:
+        bpy.ops.object.metaball_add()
+    made = bpy.context.object
+    bpy.context.view_layer.update()
+    alone = bpy.data.meshes.new_from_object(made.evaluated_get(bpy.context.evaluated_depsgraph_get()))
+    alone.calc_loop_triangles()
+    num_faces = len(alone.loop_triangles)
+    assert num_faces
+    assert len(part("true_mesh").true_mesh((made,)).faces) == num_faces
+
+
+def test_an_object_that_is_in_no_picture_says_why(cube: Any, tmp_path: Path) -> None:
+    generate(view_count=2)
+    cube.visible_camera = False
+    with pytest.raises(RuntimeError, match=r"Cube is in no picture: is it hidden from cameras\?"):
+        rendered(tmp_path)
+    assert not list(tmp_path.rglob("transforms.json"))
+    cube.visible_camera = True
+    hide_collection_in_renders(cube)
+    before = state()
+    with pytest.raises(RuntimeError, match=r"Cube is in no picture: is its collection hidden from renders\?"):
+        rendered(tmp_path)
+    assert state() == before
+
+
+def test_a_linked_object_of_the_same_name_is_another_one(cube: Any, tmp_path: Path) -> None:
+    bpy.data.libraries.write(str(tmp_path / "other.blend"), {cube}, fake_user=True)
+    with bpy.data.libraries.load(str(tmp_path / "other.blend"), link=True) as (_, wanted):
+        wanted.objects = ["Cube"]
+    (linked,) = wanted.objects
+    bpy.context.scene.collection.objects.link(linked)
+    cube.location = (3, 1, 5)
+    for made in (cube, linked):
+        generate(view_count=2, target=made.name_full)
+        assert bpy.context.scene.fewview.target == made
+        folder = rendered(tmp_path)
+        middle = true_surface(folder).positions.mean(axis=0)
+        assert middle == pytest.approx(tuple(made.location), abs=1e-5)
+        assert_pictures_show_the_truth(folder)
+
+
+def test_objects_behind_the_scene_are_not_in_the_mask(cube: Any, tmp_path: Path) -> None:
+    generate(view_count=2, target="Cube")
+    floor = bpy.data.objects["Floor"]
+    behind = bpy.data.scenes.new("behind")
+    bpy.context.scene.collection.objects.unlink(floor)
+    behind.collection.objects.link(floor)
+    bpy.context.scene.background_set = behind
+    assert_pictures_show_the_truth(rendered(tmp_path, target="Cube"))
+    assert floor.visible_camera
+
+
+def test_pencils_are_hidden_from_every_engine(cube: Any, rendering: ModuleType) -> None:
+    """Not rendered, as it needs a GPU or its software: no ray shows them, so none can be kept from them."""
+    if bpy.app.version < (4, 3):
+        bpy.ops.object.gpencil_add(type="STROKE")
+    else:
+        bpy.ops.object.grease_pencil_add(type="STROKE")
+    changes = rendering._mask_changes(bpy.context.scene, (cube,), "CYCLES")
+    assert (bpy.context.object, "hide_render", True) in changes
+    assert (bpy.data.objects["Floor"], "visible_camera", False) in changes
+
+
+def test_what_keys_would_show_in_the_mask_is_refused(cube: Any, tmp_path: Path) -> None:
+    generate(view_count=2, target="Cube")
+    floor = bpy.data.objects["Floor"]
+    floor.keyframe_insert("hide_render", frame=1)
+    before = state()
+    with pytest.raises(RuntimeError, match="Floor would be in the mask: its 'Disable in Renders' has keys"):
+        rendered(tmp_path, target="Cube", engine="WORKBENCH")
+    assert state() == before
+    assert_pictures_show_the_truth(rendered(tmp_path, target="Cube"))
 
 
 # What is left behind
@@ -591,6 +866,47 @@ def test_a_second_blender_renders_what_is_not_saved(
     assert image.filepath == "//textures/green.png"
     assert bpy.data.filepath == str(tmp_path / "own/work.blend")
     assert {path: path.read_bytes() for path in before} == before
+
+
+def test_a_second_blender_has_what_was_simulated(
+    cube: Any, second_blender: ModuleType, tmp_path: Path
+) -> None:
+    """Neither the frames of a cloth nor where it lies are to be had without them."""
+    scene = bpy.context.scene
+    bpy.ops.mesh.primitive_grid_add(x_subdivisions=4, y_subdivisions=4, location=(3, 1, 3))
+    cloth = bpy.context.object
+    cloth.modifiers.new("Cloth", "CLOTH").point_cache.frame_end = 12
+    for frame in range(1, 13):
+        scene.frame_set(frame)
+    fallen = cloth.evaluated_get(bpy.context.evaluated_depsgraph_get()).data.vertices[0].co.z
+    assert fallen < -0.3
+    generate(view_count=2, target=cloth.name)
+    folder = rendered(tmp_path, target=cloth.name)
+    lowest = true_surface(folder).positions[:, 2].min()
+    assert lowest == pytest.approx(3 + fallen, abs=0.01)
+    assert bpy.data.filepath == ""
+    assert not (folder / second_blender.COPY).exists()
+
+
+def test_what_a_second_blender_lacks_is_said(
+    cube: Any, second_blender: ModuleType, rendering: ModuleType, tmp_path: Path
+) -> None:
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "own.blend"))  # else there is no cache on disk
+    scene = bpy.context.scene
+    wanted = request(rendering, views=(rendering.View(camera=""), rendering.View(camera="", frame=5)))
+    assert second_blender.not_copied(scene, wanted) == ()
+    image = bpy.data.images.new("painted", 2, 2)
+    image.pixels = [0.0] * 16
+    image.pack()
+    assert second_blender.not_copied(scene, wanted) == ()
+    image.pixels = [1.0] * 16
+    cube.modifiers.new("Cloth", "CLOTH").point_cache.use_disk_cache = True
+    assert second_blender.not_copied(scene, wanted) == (
+        "Rendered as they were last saved or packed: painted",
+        "Rendered without what is simulated in a cache on disk: Cube",
+    )
+    first = request(rendering, views=(rendering.View(camera=""),))  # where nothing is simulated yet
+    assert len(second_blender.not_copied(scene, first)) == 1
 
 
 def test_an_error_in_the_second_blender_reaches_the_first(
