@@ -188,7 +188,7 @@ def build_report(inputs: ReportInputs, config: ReportConfig, *, progress: Progre
     drawn = mesh
     if truth is not None:
         progress(0.6, "measuring against the truth")
-        # a surface far off is about equally far from all points of the other: the nearest takes a search of all
+        # all points of a surface far off are about equally near: each search takes a look at all of them
         seed, is_near = inputs.seed, not elsewhere_text(mesh, truth)
         num_samples = config.error_samples if is_near else min(_FEW_SAMPLES, config.error_samples)
         error = surface_error(mesh, truth, cameras=given, seed=seed, num_samples=num_samples)

@@ -7,6 +7,7 @@ from dataclasses import replace
 from html.parser import HTMLParser
 from io import BytesIO
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -30,6 +31,7 @@ from backend.report_page.wording import (
     stage_text,
 )
 from backend.scene import SurfaceMesh, Unplaced, no_progress, transform_points
+from backend.stages import report
 from backend.stages.report import (
     Report,
     ReportConfig,
@@ -349,6 +351,26 @@ def test_a_photograph_the_mesh_does_not_reach_has_no_likeness() -> None:
     assert report.photos[-1].covered_share == 0.0
     assert report.mean_psnr_db == pytest.approx(np.mean([photo.psnr_db for photo in report.photos[:-1]]))
     render_report_html(report)
+
+
+def test_a_truth_of_another_scale_is_measured_by_few_samples(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Else that takes an hour."""
+    inputs = with_truth(small_run(num_photos=1), tmp_path / "truth.ply", resolution=2)
+    asked: list[int] = []
+    measure = report.surface_error
+
+    def counted(*args: Any, num_samples: int, **kwargs: Any) -> Any:
+        asked.append(num_samples)
+        return measure(*args, num_samples=num_samples, **kwargs)
+
+    monkeypatch.setattr(report, "surface_error", counted)
+    for scale in (1.0, 1000.0):
+        truth = trimesh.load(tmp_path / "truth.ply")
+        truth.apply_scale(scale).export(tmp_path / "scaled.ply")
+        build_report(replace(inputs, truth=tmp_path / "scaled.ply"), SMALL, progress=no_progress)
+    assert asked == [SMALL.error_samples, 2000]
 
 
 def test_an_unreadable_truth_is_told(tmp_path: Path) -> None:
