@@ -79,6 +79,15 @@ def managed_folder(base: Path) -> Path:
     return base / MANAGED_NAME
 
 
+def short_folder(environment: Mapping[str, str], *, windows: bool = sys.platform == "win32") -> Path | None:
+    """Where the managed environment goes on Windows; None elsewhere, and where there is no such folder.
+
+    There the folder that Blender keeps for an extension leaves too few characters for the files of torch.
+    """
+    local = environment.get("LOCALAPPDATA")
+    return Path(local) / "fewview" if windows and local else None
+
+
 def can_be_removed(folder: Path) -> bool:
     """Whether the folder is a managed environment that the installer made."""
     return is_ours(folder)

@@ -22,7 +22,7 @@ class FEWVIEW_AP_preferences(bpy.types.AddonPreferences):
     )
     environment_folder: StringProperty(
         name="Environment Folder",
-        description="Where Set Up FewView puts its Python; the extension's own folder where this is empty",
+        description="Where Set Up FewView puts its Python; a folder of its own where this is empty",
         subtype="DIR_PATH",
     )
     torch_build: EnumProperty(

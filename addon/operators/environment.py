@@ -64,8 +64,9 @@ def backend_state(context: bpy.types.Context) -> tuple[State, str]:
 def managed_folder(context: bpy.types.Context) -> Path:
     """Where the managed environment is, or would be made."""
     chosen = preferences_of(context).environment_folder
-    base = Path(bpy.path.abspath(chosen)).expanduser() if chosen else user_folder()
-    return environment.managed_folder(base)
+    if chosen:
+        return environment.managed_folder(Path(bpy.path.abspath(chosen)).expanduser())
+    return environment.managed_folder(environment.short_folder(os.environ) or user_folder())
 
 
 def user_folder(name: str = "", *, create: bool = False) -> Path:
@@ -158,6 +159,8 @@ class FEWVIEW_OT_install_backend(bpy.types.Operator):
         column.label(text=str(self._folder(context)), icon="FILE_FOLDER", translate=False)
         if self._folder(context).is_relative_to(user_folder()):
             column.label(text="Goes when the extension is removed; the preferences can name another folder")
+        else:
+            column.label(text="Stays when the extension is removed: press Remove Setup before that")
         layout.prop(self, "build")
         if environment.can_be_removed(self._folder(context)):
             layout.prop(self, "again")

@@ -80,6 +80,7 @@ def _install(plan: Plan, request: CancelRequest, speaking: Speaker) -> None:
             stages=_STAGES,
         )
         if plan.again or not _is_ready(plan, installer):
+            folders.check_length(plan.folder)
             folders.check_space(plan.folder, plan.build)
             _make(plan, installer)
     say_last(speaking, protocol.Finished(output=str(plan.folder), files=()))

@@ -133,6 +133,31 @@ def test_an_environment_whose_python_was_removed_is_said(environment: Any, tmp_p
         environment.find_python(variable="", preference="", managed=tmp_path)
 
 
+@pytest.mark.parametrize(
+    ("windows", "variables", "expected"),
+    [
+        (True, {"LOCALAPPDATA": "/local"}, Path("/local/fewview")),
+        (True, {}, None),
+        (False, {"LOCALAPPDATA": "/local"}, None),
+    ],
+)
+def test_on_windows_the_managed_one_has_a_short_path(
+    environment: Any, windows: bool, variables: dict[str, str], expected: Path | None
+) -> None:
+    assert environment.short_folder(variables, windows=windows) == expected
+
+
+def test_the_managed_one_goes_where_it_is_chosen_else_short_else_to_blenders_folder(
+    preferences: Any, operators: Any, environment: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(environment, "short_folder", lambda _: tmp_path / "short")
+    assert operators.managed_folder(bpy.context) == tmp_path / "managed" / "environment"
+    preferences.environment_folder = ""
+    assert operators.managed_folder(bpy.context) == tmp_path / "short" / "environment"
+    monkeypatch.undo()
+    assert operators.managed_folder(bpy.context) == operators.user_folder() / "environment"
+
+
 # By hand.
 
 

@@ -16,13 +16,15 @@ import threading
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
+from importlib.metadata import distribution
 from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 
 from backend.commands import environment_folder as folders
-from backend.commands.install import Plan, begun_for
+from backend.commands.cancelling import CancelRequest
+from backend.commands.install import Plan, _install, begun_for
 from backend.commands.install_progress import TEXT_LENGTH, InstallProgress, shortened
 from backend.commands.packages import explain, pip_environment, pip_settings
 from backend.doctor import DEPENDENCIES
@@ -526,6 +528,83 @@ def test_a_small_disk_is_told_before_anything_is_made(
     (tmp_path / "a").mkdir()
     ours(tmp_path / "a" / "b.part", "1234")
     folders.check_space(folder, "cpu")
+
+
+# Windows takes no long paths.
+
+ROAMING = "C:/Users/max/AppData/Roaming/Blender Foundation/Blender/4.5/extensions/.user/user_default/fewview"
+LOCAL = "C:/Users/nineteen characters/AppData/Local/fewview"
+
+
+@pytest.mark.parametrize(("place", "fits"), [(ROAMING, False), (LOCAL, True), (LOCAL + "X", False)])
+def test_a_folder_that_is_too_deep_for_windows_is_refused(
+    place: str, fits: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = Path(place) / "environment"
+    folders.check_length(folder)  # where paths have no such limit
+    monkeypatch.setattr(folders, "takes_long_paths", lambda: False)
+    if fits:
+        folders.check_length(folder)
+        return
+    with pytest.raises(ReconstructionError, match="characters too long") as caught:
+        folders.check_length(folder)
+    assert "shorter Environment Folder" in caught.value.remedy
+
+
+def test_that_is_said_before_anything_is_made(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nor is anything fetched."""
+    monkeypatch.setattr(folders, "takes_long_paths", lambda: False)
+    monkeypatch.setattr("backend.commands.install._make", lambda *_: pytest.fail("it began"))
+    plan = Plan(folder=tmp_path / ("deep" * 40) / "environment")
+    with pytest.raises(ReconstructionError, match="characters too long"):
+        _install(plan, CancelRequest(), SimpleNamespace(say=lambda _: None))  # type: ignore[arg-type]
+
+
+def test_no_package_has_longer_names_than_are_reckoned_with() -> None:
+    """Of torch as it is here: other builds have another name, at most that with "+cu130"."""
+    found = [distribution(name) for name in DEPENDENCIES.values()]
+    torch = distribution("torch").version
+    longest_build = f"torch-{torch.partition('+')[0]}+cu130."
+    names = [str(path) for package in found for path in package.files or ()]
+    assert max(len(name.replace(f"torch-{torch}.", longest_build)) for name in names) == folders._LONGEST_NAME
+
+
+@pytest.mark.parametrize(
+    ("path", "whole"),
+    [
+        (r"C:\a\..\b c", r"\\?\C:\b c"),
+        (r"\\server\share\a", r"\\?\UNC\server\share\a"),
+        (r"\\?\C:\a", r"\\?\C:\a"),
+    ],
+)
+def test_long_paths_are_spelled_as_windows_takes_them(path: str, whole: str) -> None:
+    assert folders.unlimited(path, windows=True) == whole
+    assert folders.unlimited(path, windows=False) == path
+
+
+def test_what_was_begun_is_measured_and_removed_however_deep(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As on Windows, where files under the plain path cannot be reached: here they lie elsewhere."""
+    plain = ours(tmp_path / "e.part", "")
+    (plain / "content").unlink()
+    deep = ours(tmp_path / "deep", "1234")
+    (deep / "a").mkdir()
+    monkeypatch.setattr(folders, "unlimited", lambda _: str(deep))
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=needed_bytes("cpu") - 4))
+    folders.check_space(tmp_path / "e", "cpu")
+    folders.remove(plain)
+    assert [entry.name for entry in deep.iterdir()] == [MARKER]
+    assert not plain.exists()
+
+
+def test_a_file_that_goes_away_while_it_is_measured_is_no_failure(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    part = ours(tmp_path / "e.part", "1234")
+    monkeypatch.setattr(os, "walk", lambda _: [(str(part), [], ["gone", "content"])])
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=needed_bytes("cpu") - 4))
+    folders.check_space(tmp_path / "e", "cpu")
 
 
 def test_unknown_builds_are_refused(tmp_path: Path) -> None:
