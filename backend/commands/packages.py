@@ -5,6 +5,7 @@ pip hold, whether in variables or in files. Standard library only.
 """
 
 import ast
+import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -25,19 +26,19 @@ _FOR_UV = {
     "cert": "SSL_CERT_FILE",
 }
 """Settings of pip, and the variables in which uv takes the same."""
-_NETWORK_WORDS = (
-    "connection",
-    "name resolution",
-    "name or service not known",
-    "getaddrinfo",
-    "timed out",
-    "proxy",
-    "ssl",
-    "max retries",
-    "dns error",
-    "network",
-    "error sending request",
-    "could not fetch url",
+_REASON = re.compile(
+    r"\s*(?:(?:[\w.]*(?:error|exception)|caused by|cause|note):|[×├╰]"
+    # for the last time: before that, an answer may have come
+    r"|WARNING: Retrying (?!\(Retry\(total=[1-9]))",
+    re.IGNORECASE,
+)
+"""Lines in which pip, an exception or uv says why it failed; the others name packages and files."""
+_NETWORK = re.compile(
+    r"(?<![\w/\\.-])"  # whole words, and not of a path
+    r"(?:connection|name resolution|name or service not known|getaddrinfo|timed out|proxy|ssl\w*|max retries|"
+    r"dns error|network|error sending request|response body|http error|http status)"
+    r"\b",
+    re.IGNORECASE,
 )
 _SHOWN_LINES = 12
 _NO_SPACE_WORDS = ("no space left", "errno 28", "not enough space", "disk quota")
@@ -85,7 +86,7 @@ def explain(tail: Sequence[str]) -> ReconstructionError:
         return ReconstructionError(
             ErrorCode.DISK_FULL, "The disk is full.", "Free some space and install again: it goes on."
         )
-    if any(words in lowered for words in _NETWORK_WORDS):
+    if is_out_of_reach(tail):
         text = "The packages could not be fetched: the package index is out of reach."
         remedy = (
             "Check the network, and set HTTPS_PROXY or pip's own settings where a proxy is needed; "
@@ -95,6 +96,11 @@ def explain(tail: Sequence[str]) -> ReconstructionError:
         text = "The packages could not be installed."
         remedy = "The lines above say why; with that mended, install again: what was fetched is kept."
     return ReconstructionError(ErrorCode.MISSING_DEPENDENCY, f"{text}\n{said}".rstrip(), remedy)
+
+
+def is_out_of_reach(tail: Sequence[str]) -> bool:
+    """Whether pip or uv failed because of the network, from the end of what it wrote."""
+    return any(_NETWORK.search(line) for line in tail if _REASON.match(line))
 
 
 def _by_uv(python: Path, wanted: Sequence[str], *, build: str, count: int, installer: Installer) -> bool:

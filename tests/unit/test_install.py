@@ -673,7 +673,6 @@ def test_texts_are_cut() -> None:
     ("line", "code", "words"),
     [
         ("ERROR: [Errno 28] No space left on device", ErrorCode.DISK_FULL, "disk is full"),
-        ("Failed to establish a new connection: [Errno 111]", ErrorCode.MISSING_DEPENDENCY, "out of reach"),
         ("ERROR: No matching distribution found for x", ErrorCode.MISSING_DEPENDENCY, "No matching"),
     ],
 )
@@ -681,6 +680,79 @@ def test_failures_of_pip_are_explained(line: str, code: ErrorCode, words: str) -
     error = explain(["before", line])
     assert error.code is code
     assert words in error.text
+
+
+COLLECTED = """\
+Collecting scikit-image>=0.24
+  Downloading scikit_image-0.26.0-cp311-cp311-win_amd64.whl.metadata (15 kB)
+Collecting networkx>=3.0 (from scikit-image>=0.24)
+  Downloading networkx-3.6.1-py3-none-any.whl.metadata (6.8 kB)
+Installing collected packages: mpmath, networkx, torch"""
+RETRYING = (
+    "WARNING: Retrying (Retry(total={}, connect=None, read=None, redirect=None, status=None)) after "
+    "connection broken by 'NewConnectionError('<pip._vendor.urllib3.connection.HTTPConnection object>: "
+    "Failed to establish a new connection: [Errno 111] Connection refused')': /simple/numpy/"
+)
+DENIED = r"""
+ERROR: Could not install packages due to an OSError: [WinError 5] Access is denied: 'C:\e\torch\fx\proxy.py'
+Check the permissions."""
+NOTHING_FOUND = """
+ERROR: Could not find a version that satisfies the requirement numpy>=1.26 (from versions: none)
+ERROR: No matching distribution found for numpy>=1.26"""
+CONFLICT = """
+ERROR: Cannot install numpy because these package versions have conflicting dependencies."""
+TOO_OLD = """
+ERROR: Could not find a version that satisfies the requirement networkx>=9 (from versions: 3.5, 3.6.1)
+ERROR: No matching distribution found for networkx>=9"""
+BROKEN_OFF = """
+ERROR: Exception:
+Traceback (most recent call last):
+  File "/e/pip/_vendor/urllib3/response.py", line 438, in _error_catcher
+pip._vendor.urllib3.exceptions.ReadTimeoutError: HTTPSConnectionPool(host='files'): Read timed out."""
+INCOMPLETE = """
+error: incomplete-download
+
+× Download failed because not enough bytes were received (0.8 MB/890 MB)
+╰─> URL: https://files/torch.whl
+
+note: This is an issue with network connectivity, not pip."""
+UV_UNREACHABLE = """\
+error: Request failed after 1 retry in 1.5s
+  cause: Failed to fetch: https://download.pytorch.org/whl/cpu/torch/
+  cause: error sending request for url (https://download.pytorch.org/whl/cpu/torch/)
+  cause: client error (Connect)"""
+UV_NO_SOLUTION = """\
+error: No solution found when resolving dependencies
+  cause: Because only networkx<=3.7 is available and you require networkx>=300, it can not be."""
+UV_OLDER = """\
+  × Failed to download `torch==2.13.0`
+  ├─▶ Failed to fetch: `https://download.pytorch.org/whl/cpu/torch.whl`
+  ╰─▶ operation timed out"""
+
+
+@pytest.mark.parametrize(
+    ("said", "expected"),
+    [
+        pytest.param(COLLECTED + DENIED, False, id="a file is held"),
+        pytest.param(
+            f"{RETRYING.format(4)}\n{COLLECTED}{DENIED}", False, id="answered in the end, then a file is held"
+        ),
+        pytest.param(COLLECTED + TOO_OLD, False, id="no such version"),
+        pytest.param(RETRYING.format(1) + TOO_OLD, False, id="answered in the end, no such version"),
+        pytest.param(RETRYING.format(0) + NOTHING_FOUND, True, id="never answered"),
+        pytest.param(RETRYING.format(0) + CONFLICT, True, id="never answered, with constraints"),
+        pytest.param(COLLECTED + BROKEN_OFF, True, id="broken off"),
+        pytest.param(COLLECTED + INCOMPLETE, True, id="incomplete"),
+        pytest.param(UV_UNREACHABLE, True, id="uv never answered"),
+        pytest.param(UV_OLDER, True, id="an older uv never answered"),
+        pytest.param(UV_NO_SOLUTION, False, id="uv found no version"),
+    ],
+)
+def test_the_network_is_named_only_where_it_is_to_blame(said: str, expected: bool) -> None:
+    """Not for the names of packages and files."""
+    error = explain(said.splitlines())
+    assert ("out of reach" in error.text) == expected
+    assert ("proxy" in error.remedy) == expected
 
 
 def test_the_users_settings_hold_and_nothing_leads_elsewhere() -> None:
