@@ -135,12 +135,15 @@ def readiness(python: Path) -> Readiness:
 
 
 def remember(python: Path, checks: Sequence[Checked], *, finished: bool) -> None:
-    """Keep what a check found; one that neither finished nor found a fault came to no result."""
+    """Keep what a check found; one that neither finished nor found a fault came to no result.
+
+    One that finished says "ready", whatever it found: a GPU that fails is no reason against the CPU.
+    """
     faults = [check for check in checks if not check.fine]
-    if faults:
-        found = Readiness(state=State.NOT_READY, text=_fault_text(faults))
-    elif finished:
+    if finished:
         found = Readiness(state=State.READY, text=_ready_text(checks))
+    elif faults:
+        found = Readiness(state=State.NOT_READY, text=_fault_text(faults))
     else:
         found = Readiness(state=State.NOT_READY, text="The check ended early; Show Log says why")
     _known[_key(python)] = found
@@ -175,10 +178,14 @@ def _key(python: Path) -> _Key:
 
 
 def _ready_text(checks: Sequence[Checked]) -> str:
-    """Its torch and its best device, such as "torch 2.13.0, CUDA NVIDIA H200"."""
-    found = {check.name: check.found for check in checks}
+    """Its torch and its best device, such as "torch 2.13.0, CUDA NVIDIA H200"; and devices that fail."""
+    found = {check.name: check.found for check in checks if check.fine}
     device = next((f"{shown} {found[name]}" for name, shown in _DEVICES.items() if name in found), "")
-    return ", ".join(filter(None, (f"torch {found.get('torch', '?')}", device)))
+    text = ", ".join(filter(None, (f"torch {found.get('torch', '?')}", device)))
+    fails = [
+        f"{_DEVICES.get(check.name, check.name)} fails: {check.found}" for check in checks if not check.fine
+    ]
+    return "; ".join([text, *fails])
 
 
 def _fault_text(faults: Sequence[Checked]) -> str:

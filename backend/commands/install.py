@@ -151,8 +151,10 @@ def _fill(plan: Plan, wanted: tuple[str, ...], installer: Installer) -> list[pro
     )
     installer.begin("check")
     checks = _check(part, installer)
-    if plan.build == "cuda" and "cuda" not in {check.name for check in checks}:
-        installer.warn("No GPU by NVIDIA was found: this environment computes on the processor.")
+    gpu = next((check for check in checks if check.name == "cuda"), None)
+    if plan.build == "cuda" and (gpu is None or not gpu.fine):
+        why = f"The GPU cannot be used ({gpu.found})" if gpu else "No GPU by NVIDIA was found"
+        installer.warn(f"{why}: this environment computes on the processor.")
     return checks
 
 

@@ -207,6 +207,20 @@ def test_readiness_is_of_one_python_as_it_was(environment: Any, tmp_path: Path) 
     assert environment.readiness(python).state is environment.State.UNKNOWN
 
 
+def test_a_gpu_that_fails_is_told_beside_ready(environment: Any, tmp_path: Path) -> None:
+    """The check says ready; the CPU is what it computes on."""
+    checks = [
+        checked(environment, "torch", "2.13.0"),
+        checked(environment, "cuda", "GTX 1080: no code for it", fine=False),
+        checked(environment, "cpu", "2 cores"),
+    ]
+    python = touch(tmp_path / "python")
+    environment.remember(python, checks, finished=True)
+    known = environment.readiness(python)
+    assert known.state is environment.State.READY
+    assert known.text == "torch 2.13.0, CPU 2 cores; CUDA fails: GTX 1080: no code for it"
+
+
 def test_what_is_missing_is_named(environment: Any, tmp_path: Path) -> None:
     python = touch(tmp_path / "python")
     faults = [checked(environment, name, "gone", fine=False) for name in "abcde"]
