@@ -16,7 +16,7 @@ from typing import Any
 import fake_layout
 import pytest
 
-from tests.stand_in_packages import write_wheels
+from tests.stand_in_packages import write_uv, write_wheels
 
 bpy = pytest.importorskip("bpy", reason="needs Blender's Python, where `import bpy` works")
 
@@ -299,6 +299,7 @@ def test_one_is_made_used_and_removed(
         environment.__name__.replace("addon.environment", "backend.doctor")
     )
     write_wheels(tmp_path / "wheels", dependencies.DEPENDENCIES)
+    write_uv(tmp_path / "wheels")
     monkeypatch.setenv("PIP_NO_INDEX", "1")
     monkeypatch.setenv("PIP_FIND_LINKS", str(tmp_path / "wheels"))
     code = Path(environment.__file__).parents[1]
