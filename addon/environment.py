@@ -129,6 +129,11 @@ def hand_lines(folder: Path, *, root: Path = ROOT, windows: bool = sys.platform 
     return f"{quoted([*python, '-m', 'venv', str(folder)])}\n{quoted(install)}"
 
 
+def shell_name(*, windows: bool = sys.platform == "win32") -> str:
+    """What those lines are written for: PowerShell, the other shell of Windows, reads quotes otherwise."""
+    return "the Command Prompt (cmd)" if windows else "a shell"
+
+
 def readiness(python: Path) -> Readiness:
     """What the last check of this Python found; unknown where it has changed since."""
     return _known.get(_key(python), Readiness(state=State.UNKNOWN, text="Not checked yet"))

@@ -28,7 +28,7 @@ class FEWVIEW_AP_preferences(bpy.types.AddonPreferences):
     torch_build: EnumProperty(
         name="Compute On",
         items=[
-            ("cpu", "CPU", "The smallest download, for every computer"),
+            ("cpu", "CPU", "The smallest download; no GPU is needed"),
             ("default", "Standard", "The usual build; on Linux with CUDA, on a Mac with MPS"),
             ("cuda", "CUDA", "For a GPU by NVIDIA; the largest download"),
         ],

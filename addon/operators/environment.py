@@ -17,7 +17,7 @@ _ONLINE = "Allow Online Access in Preferences > System first, or Set Up by Hand"
 _BUSY = "Wait until the running job ends, or cancel it"
 _BUILDS = [
     ("PREFERENCES", "As in the Preferences", "The build that is chosen there"),
-    ("cpu", "CPU", "The smallest download, for every computer"),
+    ("cpu", "CPU", "The smallest download; no GPU is needed"),
     ("default", "Standard", "The usual build; on Linux with CUDA, on a Mac with MPS"),
     ("cuda", "CUDA", "For a GPU by NVIDIA; the largest download"),
 ]
@@ -235,8 +235,8 @@ class FEWVIEW_OT_copy_install_lines(bpy.types.Operator):
         context.window_manager.clipboard = lines
         self.report(
             {"INFO"},
-            f"Copied. Run them in a shell, where Python {environment.HAND_VERSION} must be installed; "
-            f"then choose {python_in(folder)} as Python in the preferences",
+            f"Copied. Run them in {environment.shell_name()}, where Python {environment.HAND_VERSION} "
+            f"must be installed; then choose {python_in(folder)} as Python in the preferences",
         )
         return {"FINISHED"}
 

@@ -22,6 +22,7 @@ from ..wire.speaker import Speaker
 from . import environment_folder as folders
 from .cancelling import CancelRequest
 from .child import run_child
+from .computers import check_computer
 from .installer import Installer
 from .packages import install_packages, pip_environment
 from .reconstruct import converse, say_last
@@ -81,6 +82,8 @@ def _install(plan: Plan, request: CancelRequest, speaking: Speaker) -> None:
             stages=_STAGES,
         )
         if plan.again or not _is_ready(plan, installer):
+            if plan.requirements_file is None:
+                check_computer()
             folders.check_length(plan.folder)
             folders.check_space(plan.folder, plan.build)
             _make(plan, installer)
@@ -136,7 +139,7 @@ def begun_for(plan: Plan) -> dict[str, object]:
 
 
 def _fill(plan: Plan, wanted: tuple[str, ...], installer: Installer) -> tuple[str, list[protocol.Checked]]:
-    """The three steps, in DIR.part; which torch there is, and what the check found. Raises as `_check` does."""
+    """The three steps, in DIR.part; the build of torch that came, and what the check found."""
     part = beside(plan.folder, PART)
     installer.begin("python")
     if not works(part, installer):

@@ -347,6 +347,8 @@ def test_the_lines_are_copied(
     folder = tmp_path / "fewview-environment"
     lines = environment.hand_lines(folder)
     assert "Python 3.12" in said
+    assert f"Run them in {environment.shell_name()}, where" in said
+    assert environment.shell_name(windows=True) == "the Command Prompt (cmd)"  # as hand_lines quotes
     assert "3.12" in lines.split()[0 if sys.platform != "win32" else 1]
     assert str(environment.python_in(folder)) in said
     assert lines.splitlines()[1].startswith(shlex.quote(str(environment.python_in(folder))))
@@ -400,6 +402,7 @@ def test_the_words_of_the_preferences_have_no_jargon(preferences: Any, operators
     chosen = properties["torch_build"].enum_items
     assert chosen.keys() == ["cpu", "default", "cuda"]  # saved in users' preferences
     for items in (asked, chosen):
+        assert "every computer" not in items["cpu"].description
         assert (items["default"].name, "index" in items["default"].description) == ("Standard", False)
 
 
@@ -430,6 +433,12 @@ def test_the_zip_holds_what_is_needed_and_nothing_else(extension_zip: Path) -> N
     }
     assert {"backend/wire/client.py", "addon/operators/environment.py"} <= set(names)
     assert not [name for name in names if "__pycache__" in name or name.endswith((".pyc", ".blend"))]
+
+
+def test_it_is_offered_to_the_computers_that_it_can_be_set_up_on() -> None:
+    """As Blender names them; backend/commands/computers.py refuses the others."""
+    with (ROOT / "blender_manifest.toml").open("rb") as file:
+        assert tomllib.load(file)["platforms"] == ["windows-x64", "macos-arm64", "linux-x64"]
 
 
 def test_permissions_say_what_for_in_a_line_that_blender_takes() -> None:

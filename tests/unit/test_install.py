@@ -26,6 +26,7 @@ import pytest
 from backend.commands import environment_folder as folders
 from backend.commands import install
 from backend.commands.cancelling import CancelRequest
+from backend.commands.computers import reason_against
 from backend.commands.install import Plan, begun_for
 from backend.commands.install_progress import TEXT_LENGTH, InstallProgress, shortened
 from backend.commands.packages import (
@@ -676,6 +677,40 @@ def test_a_small_disk_is_told_before_anything_is_made(
     (tmp_path / "a").mkdir()
     ours(tmp_path / "a" / "b.part", "1234")
     folders.check_space(folder, "cpu")
+
+
+# Computers that there are no packages for.
+
+
+@pytest.mark.parametrize(
+    ("system", "machine", "macos", "words"),
+    [
+        ("win32", "win-amd64", "", ""),
+        ("win32", "win-arm64", "", "not made for the processor win-arm64"),
+        ("darwin", "arm64", "14.0", ""),
+        ("darwin", "arm64", "26.1", ""),
+        ("darwin", "arm64", "", ""),  # which is not known
+        ("darwin", "arm64", "13.7.1", "not made for macOS 13.7.1"),
+        ("darwin", "x86_64", "15.2", "not made for Blenders and Macs for Intel"),  # also on Apple silicon
+        ("linux", "x86_64", "", ""),
+        ("linux", "aarch64", "", "not made for the processor aarch64"),
+        ("freebsd14", "amd64", "", ""),
+    ],
+)
+def test_where_there_are_no_packages_is_known(system: str, machine: str, macos: str, words: str) -> None:
+    reason = reason_against(system, machine, macos)
+    assert words in reason
+    assert bool(reason) == bool(words)
+
+
+def test_where_there_are_none_nothing_is_begun(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(install, "_make", lambda *_: pytest.fail("it began"))
+    monkeypatch.setattr("platform.machine", lambda: "ppc64")
+    monkeypatch.setattr("sys.platform", "linux")
+    plan = Plan(folder=tmp_path / "environment")
+    with pytest.raises(ReconstructionError, match=r"cannot be set up here: .* ppc64") as caught:
+        install._install(plan, CancelRequest(), SimpleNamespace(say=lambda _: None))  # type: ignore[arg-type]
+    assert "Apple silicon" in caught.value.remedy
 
 
 # Windows takes no long paths.
