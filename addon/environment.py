@@ -79,6 +79,15 @@ def managed_folder(base: Path) -> Path:
     return base / MANAGED_NAME
 
 
+def short_folder(environment: Mapping[str, str], *, windows: bool = sys.platform == "win32") -> Path | None:
+    """Where the managed environment goes on Windows; None elsewhere, and where there is no such folder.
+
+    There the folder that Blender keeps for an extension leaves too few characters for the files of torch.
+    """
+    local = environment.get("LOCALAPPDATA")
+    return Path(local) / "fewview" if windows and local else None
+
+
 def can_be_removed(folder: Path) -> bool:
     """Whether the folder is a managed environment that the installer made."""
     return is_ours(folder)
@@ -120,18 +129,26 @@ def hand_lines(folder: Path, *, root: Path = ROOT, windows: bool = sys.platform 
     return f"{quoted([*python, '-m', 'venv', str(folder)])}\n{quoted(install)}"
 
 
+def shell_name(*, windows: bool = sys.platform == "win32") -> str:
+    """What those lines are written for: PowerShell, the other shell of Windows, reads quotes otherwise."""
+    return "the Command Prompt (cmd)" if windows else "a shell"
+
+
 def readiness(python: Path) -> Readiness:
     """What the last check of this Python found; unknown where it has changed since."""
     return _known.get(_key(python), Readiness(state=State.UNKNOWN, text="Not checked yet"))
 
 
 def remember(python: Path, checks: Sequence[Checked], *, finished: bool) -> None:
-    """Keep what a check found; one that neither finished nor found a fault came to no result."""
+    """Keep what a check found; one that neither finished nor found a fault came to no result.
+
+    One that finished says "ready", whatever it found: a GPU that fails is no reason against the CPU.
+    """
     faults = [check for check in checks if not check.fine]
-    if faults:
-        found = Readiness(state=State.NOT_READY, text=_fault_text(faults))
-    elif finished:
+    if finished:
         found = Readiness(state=State.READY, text=_ready_text(checks))
+    elif faults:
+        found = Readiness(state=State.NOT_READY, text=_fault_text(faults))
     else:
         found = Readiness(state=State.NOT_READY, text="The check ended early; Show Log says why")
     _known[_key(python)] = found
@@ -166,10 +183,14 @@ def _key(python: Path) -> _Key:
 
 
 def _ready_text(checks: Sequence[Checked]) -> str:
-    """Its torch and its best device, such as "torch 2.13.0, CUDA NVIDIA H200"."""
-    found = {check.name: check.found for check in checks}
+    """Its torch and its best device, such as "torch 2.13.0, CUDA NVIDIA H200"; and devices that fail."""
+    found = {check.name: check.found for check in checks if check.fine}
     device = next((f"{shown} {found[name]}" for name, shown in _DEVICES.items() if name in found), "")
-    return ", ".join(filter(None, (f"torch {found.get('torch', '?')}", device)))
+    text = ", ".join(filter(None, (f"torch {found.get('torch', '?')}", device)))
+    fails = [
+        f"{_DEVICES.get(check.name, check.name)} fails: {check.found}" for check in checks if not check.fine
+    ]
+    return "; ".join([text, *fails])
 
 
 def _fault_text(faults: Sequence[Checked]) -> str:

@@ -22,13 +22,13 @@ class FEWVIEW_AP_preferences(bpy.types.AddonPreferences):
     )
     environment_folder: StringProperty(
         name="Environment Folder",
-        description="Where Set Up FewView puts its Python; the extension's own folder where this is empty",
+        description="Where Set Up FewView puts its Python; a folder of its own where this is empty",
         subtype="DIR_PATH",
     )
     torch_build: EnumProperty(
         name="Compute On",
         items=[
-            ("cpu", "CPU", "The smallest download, for every computer"),
+            ("cpu", "CPU", "The smallest download; no GPU is needed"),
             ("default", "Standard", "The usual build; on Linux with CUDA, on a Mac with MPS"),
             ("cuda", "CUDA", "For a GPU by NVIDIA; the largest download"),
         ],

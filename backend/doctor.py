@@ -10,10 +10,12 @@ from dataclasses import asdict, dataclass
 from importlib.metadata import PackageNotFoundError, version
 
 from .errors import ErrorCode, ReconstructionError
+from .failures import first_line
 
 MIN_PYTHON = (3, 11)
 _PYTHON = "Python"
-_COMPILED = "compiled code"
+_SPARE = ("cuda", "mps")
+"""Devices that a reconstruction can do without."""
 DEPENDENCIES = {
     # pillow stands before pycolmap: imported the other way round, the two corrupt memory.
     "numpy": "numpy",
@@ -58,13 +60,13 @@ def examine() -> Iterator[Check]:
 
 
 def is_ready(checks: Sequence[Check]) -> bool:
-    """Whether a reconstruction can start here."""
-    return all(check.fine for check in checks)
+    """Whether a reconstruction can start here, on the CPU at least."""
+    return not _faults(checks)
 
 
 def not_ready(checks: Sequence[Check]) -> ReconstructionError:
-    """What is wrong, where something is: the first thing in full, the others by name."""
-    first, *others = (check for check in checks if not check.fine)
+    """What is wrong, where it is not ready: the first thing in full, the others by name."""
+    first, *others = _faults(checks)
     packages = [check.name for check in (first, *others) if check.name in DEPENDENCIES.values()]
     more = f"; also {', '.join(check.name for check in others)}" if others else ""
     is_device = not packages and first.name != _PYTHON
@@ -80,21 +82,25 @@ def as_text(checks: Sequence[Check]) -> str:
     """The checks for a person."""
     width = max(len(check.name) for check in checks)
     lines = [f"{'ok ' if check.fine else 'NOT'} {check.name:<{width}} {check.found}" for check in checks]
-    if is_ready(checks):
-        return "\n".join([*lines, "ready"])
-    return "\n".join([*lines, f"not ready: {_by_hand(checks)}"])
+    if faults := _faults(checks):
+        return "\n".join([*lines, f"not ready: {_by_hand(faults[0])}"])
+    spare = [check.name for check in checks if not check.fine]
+    but = f", but not on {' and '.join(spare)}: compute with `--device cpu`"
+    return "\n".join([*lines, "ready" + (but if spare else "")])
 
 
-def _by_hand(checks: Sequence[Check]) -> str:
+def _faults(checks: Sequence[Check]) -> list[Check]:
+    """What keeps a reconstruction from starting: a GPU that fails does not."""
+    return [check for check in checks if not check.fine and check.name not in _SPARE]
+
+
+def _by_hand(first: Check) -> str:
     """What to do in a shell about the first thing that is wrong."""
-    first = next(check for check in checks if not check.fine)
     if first.name == _PYTHON:
         return f"take Python {'.'.join(map(str, MIN_PYTHON))} or a later one"
     if first.name in DEPENDENCIES.values():
         return f"in FewView's folder run `{sys.executable} -m pip install --constraint constraints.txt .`"
-    if first.name == _COMPILED:
-        return "install the packages again; if that does not help, report it with the lines above"
-    return f"update the driver of {first.name}, or compute with `--device cpu`"
+    return "install the packages again; if that does not help, report it with the lines above"
 
 
 def as_json(checks: Sequence[Check]) -> str:
@@ -143,14 +149,17 @@ def _check_compiler() -> Check:
     error = max(error_of() for error_of in known)
     seconds = time.perf_counter() - started
     wrong = "" if error < 1e-5 else f", but computes wrongly (error {error:.2g})"
-    return Check(name=_COMPILED, fine=not wrong, found=f"ready after {seconds:.1f} s{wrong}")
+    return Check(name="compiled code", fine=not wrong, found=f"ready after {seconds:.1f} s{wrong}")
 
 
 def _check_devices() -> Iterator[Check]:
-    from .machine import available_devices
+    from .machine import seen_devices
 
-    for kind, name in available_devices().items():
-        yield _check_device(kind, name)
+    for device in seen_devices():
+        if device.fault:
+            yield Check(name=device.kind, fine=False, found=f"{device.name}: {device.fault}")
+        else:
+            yield _check_device(device.kind, device.name)
 
 
 def _check_device(kind: str, name: str, solve: Callable[[str], float] | None = None) -> Check:
@@ -158,7 +167,7 @@ def _check_device(kind: str, name: str, solve: Callable[[str], float] | None = N
     try:
         error = (solve or _gradient_error)(kind)
     except RuntimeError as reason:
-        return Check(name=kind, fine=False, found=f"{name}: {reason}")
+        return Check(name=kind, fine=False, found=f"{name}: {first_line(reason)}")
     wrong = "" if error < 1e-5 else f": computes wrongly (error {error:.2g})"
     return Check(name=kind, fine=not wrong, found=name + wrong)
 

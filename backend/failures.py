@@ -47,6 +47,11 @@ def output_unusable(error: OSError, text: str, remedy: str) -> Exception:
     return error if is_disk_full(error) else ReconstructionError(ErrorCode.OUTPUT_UNUSABLE, text, remedy)
 
 
+def first_line(error: Exception) -> str:
+    """What an error says, without the advice for programmers that torch puts below it."""
+    return str(error).partition("\n")[0]
+
+
 def is_disk_full(error: OSError) -> bool:
     """Whether the disk, or the user's share of it, has no room left."""
     return error.errno in (errno.ENOSPC, errno.EDQUOT)

@@ -1,22 +1,71 @@
 """What this computer offers: devices, cores, memory; and torch set up for them."""
 
 import os
+import re
 import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import torch
 
 from .errors import ErrorCode, ReconstructionError
+from .failures import first_line
+
+_ARCHITECTURE = re.compile(r"(sm|compute)_(\d+)(\d)([af]?)$")
+
+
+@dataclass(frozen=True, kw_only=True)
+class SeenDevice:
+    """A device that torch sees."""
+
+    kind: str
+    name: str
+    fault: str = ""
+    """What keeps torch from using it; empty where nothing is known to."""
+
+
+def seen_devices() -> tuple[SeenDevice, ...]:
+    """The devices that torch sees here, best first, with those that it cannot use."""
+    cuda = (_cuda(),) if torch.cuda.is_available() else ()
+    mps = (SeenDevice(kind="mps", name="Apple GPU"),) if torch.backends.mps.is_available() else ()
+    return (*cuda, *mps, SeenDevice(kind="cpu", name=f"{usable_cores()} cores"))
 
 
 def available_devices() -> dict[str, str]:
     """Kinds of devices torch can use here, best first, with their names."""
-    found = {}
-    if torch.cuda.is_available():
-        found["cuda"] = torch.cuda.get_device_name()
-    if torch.backends.mps.is_available():
-        found["mps"] = "Apple GPU"
-    return {**found, "cpu": f"{usable_cores()} cores"}
+    return {device.kind: device.name for device in seen_devices() if not device.fault}
+
+
+def _cuda() -> SeenDevice:
+    try:
+        name, capability = torch.cuda.get_device_name(), torch.cuda.get_device_capability()
+    except RuntimeError as error:  # of the driver
+        return SeenDevice(kind="cuda", name="GPU", fault=first_line(error))
+    lacks = f"this torch has no code for its compute capability {'.'.join(map(str, capability))}"
+    is_fine = covers(torch.cuda.get_arch_list(), capability)
+    return SeenDevice(kind="cuda", name=name, fault="" if is_fine else lacks)
+
+
+def covers(architectures: Sequence[str], capability: tuple[int, int]) -> bool:
+    """Whether an NVIDIA GPU of this compute capability runs code for one of the architectures.
+
+    They are written as torch.cuda.get_arch_list does. True where none is of NVIDIA: nothing is known then.
+    """
+    known = [match for match in map(_ARCHITECTURE.match, architectures) if match]
+    return not known or any(_runs(match, capability) for match in known)
+
+
+def _runs(architecture: re.Match[str], capability: tuple[int, int]) -> bool:
+    """Machine code (sm) runs from its version to the next major one, what is compiled on the spot for ever.
+
+    Unless it is for that version alone (a), or for its family, which is of one major version (f).
+    """
+    form, major, minor, only = architecture.groups()
+    version = int(major), int(minor)
+    if only == "a":
+        return capability == version
+    return capability >= version and (capability[0] == version[0] or (form, only) == ("compute", ""))
 
 
 def choose_device(kind: str) -> torch.device:
@@ -29,9 +78,11 @@ def choose_device(kind: str) -> torch.device:
     if kind == "auto":
         return torch.device("cuda" if "cuda" in available else "cpu")
     if kind not in available:
+        faults = [f"{seen.name}: {seen.fault}" for seen in seen_devices() if seen.kind == kind and seen.fault]
+        why = faults[0] if faults else f"there is {', '.join(available)}"
         raise ReconstructionError(
             ErrorCode.DEVICE_UNAVAILABLE,
-            f"The device {kind} is not available here (there is {', '.join(available)}).",
+            f"The device {kind} is not available here ({why}).",
             "Choose the device automatically (auto), or install a torch that supports your GPU.",
         )
     return torch.device(kind)

@@ -39,6 +39,18 @@ for module, check in checks.items():
     setattr(compiled, check, lambda: 0.0)
 """
 """Stands in for what it would compile too, which needs a real numpy."""
+FAKE_UV = """
+import os, subprocess, sys
+words = sys.argv[1:]
+assert words[:2] == ["pip", "install"], words
+assert os.environ["UV_FIND_LINKS"] == ",".join(os.environ["PIP_FIND_LINKS"].split())
+assert words[words.index("--torch-backend") + 1] == "cpu"
+assert words[words.index("--python") + 1] == sys.executable
+del words[words.index("--torch-backend"):][:2]
+rest = words[words.index("--constraint"):]
+sys.exit(subprocess.run([sys.executable, "-m", "pip", "install", *rest]).returncode)
+"""
+"""Installs what it is asked for with pip, after a look at how it is asked."""
 CODE = {"torch": FAKE_TORCH, "numba": FAKE_NUMBA}
 
 
@@ -55,6 +67,11 @@ def write_wheel(folder: Path, distribution: str, version: str, *, module: str, c
     with zipfile.ZipFile(folder / f"{name}-{version}-py3-none-any.whl", "w") as wheel:
         for path, text in content.items():
             wheel.writestr(path, text)
+
+
+def write_uv(folder: Path) -> None:
+    """A uv that takes the CPU's build of torch from where pip has it."""
+    write_wheel(folder, "uv", "1.0", module="uv", code=FAKE_UV)
 
 
 def constrained_version(distribution: str) -> str:

@@ -17,7 +17,7 @@ _ONLINE = "Allow Online Access in Preferences > System first, or Set Up by Hand"
 _BUSY = "Wait until the running job ends, or cancel it"
 _BUILDS = [
     ("PREFERENCES", "As in the Preferences", "The build that is chosen there"),
-    ("cpu", "CPU", "The smallest download, for every computer"),
+    ("cpu", "CPU", "The smallest download; no GPU is needed"),
     ("default", "Standard", "The usual build; on Linux with CUDA, on a Mac with MPS"),
     ("cuda", "CUDA", "For a GPU by NVIDIA; the largest download"),
 ]
@@ -64,8 +64,9 @@ def backend_state(context: bpy.types.Context) -> tuple[State, str]:
 def managed_folder(context: bpy.types.Context) -> Path:
     """Where the managed environment is, or would be made."""
     chosen = preferences_of(context).environment_folder
-    base = Path(bpy.path.abspath(chosen)).expanduser() if chosen else user_folder()
-    return environment.managed_folder(base)
+    if chosen:
+        return environment.managed_folder(Path(bpy.path.abspath(chosen)).expanduser())
+    return environment.managed_folder(environment.short_folder(os.environ) or user_folder())
 
 
 def user_folder(name: str = "", *, create: bool = False) -> Path:
@@ -158,6 +159,8 @@ class FEWVIEW_OT_install_backend(bpy.types.Operator):
         column.label(text=str(self._folder(context)), icon="FILE_FOLDER", translate=False)
         if self._folder(context).is_relative_to(user_folder()):
             column.label(text="Goes when the extension is removed; the preferences can name another folder")
+        else:
+            column.label(text="Stays when the extension is removed: press Remove Setup before that")
         layout.prop(self, "build")
         if environment.can_be_removed(self._folder(context)):
             layout.prop(self, "again")
@@ -232,8 +235,8 @@ class FEWVIEW_OT_copy_install_lines(bpy.types.Operator):
         context.window_manager.clipboard = lines
         self.report(
             {"INFO"},
-            f"Copied. Run them in a shell, where Python {environment.HAND_VERSION} must be installed; "
-            f"then choose {python_in(folder)} as Python in the preferences",
+            f"Copied. Run them in {environment.shell_name()}, where Python {environment.HAND_VERSION} "
+            f"must be installed; then choose {python_in(folder)} as Python in the preferences",
         )
         return {"FINISHED"}
 

@@ -4,10 +4,12 @@ Only folders with the installer's marker in them are ever changed. Standard libr
 """
 
 import json
+import ntpath
 import os
 import shutil
+import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from ..errors import ErrorCode, ReconstructionError
@@ -15,6 +17,11 @@ from ..failures import output_unusable
 from ..file_lock import lock
 from ..held_files import when_let_go
 from ..wire.environment import LOCK, MARKER, OLD, PART, beside, is_ours, needed_bytes
+
+_LONGEST_NAME = 173
+"""Characters of a file's path within site-packages, at most: those of licences in torch 2.13.0+cu130."""
+_LONGEST_PATH = 259
+"""What Windows takes, unless long paths are switched on."""
 
 
 @contextmanager
@@ -52,6 +59,20 @@ def check_ours(*folders: Path) -> None:
             ErrorCode.OUTPUT_UNUSABLE,
             f"{folder} is there and was not made by FewView, so it is left as it is.",
             "Choose a new folder for the environment.",
+        )
+
+
+def check_length(folder: Path) -> None:
+    """ReconstructionError(OUTPUT_UNUSABLE) where Windows takes no paths as long as those of the packages."""
+    packages = beside(folder, PART) / "Lib" / "site-packages"
+    surplus = len(str(packages)) + 1 + _LONGEST_NAME - _LONGEST_PATH
+    if surplus > 0 and not takes_long_paths():
+        raise ReconstructionError(
+            ErrorCode.OUTPUT_UNUSABLE,
+            f"The path of {folder} is {surplus} characters too long: torch has files with long names, and "
+            f"Windows takes paths of {_LONGEST_PATH} characters.",
+            "Choose a shorter Environment Folder in the add-on's preferences, such as C:\\fewview, "
+            "or switch on long paths in Windows.",
         )
 
 
@@ -129,13 +150,43 @@ def remove(folder: Path) -> None:
 
 def empty(folder: Path) -> None:
     """Remove what is in a folder of ours, but for the marker."""
-    for entry in list(folder.iterdir()):
+    for entry in list(Path(unlimited(str(folder))).iterdir()):
         if entry.name == MARKER:
             continue
         if entry.is_dir() and not entry.is_symlink():
             shutil.rmtree(entry)
         else:
             entry.unlink()
+
+
+if sys.platform == "win32":
+
+    def takes_long_paths() -> bool:
+        """Whether paths may be as long as they like, which a setting of Windows says."""
+        import winreg
+
+        try:
+            place = r"SYSTEM\CurrentControlSet\Control\FileSystem"
+            with winreg.OpenKey(winreg.HKEY_LOCAL_MACHINE, place) as key:
+                return bool(winreg.QueryValueEx(key, "LongPathsEnabled")[0])
+        except OSError:
+            return False
+
+else:
+
+    def takes_long_paths() -> bool:
+        """Whether paths may be as long as they like, which a setting of Windows says."""
+        return True
+
+
+def unlimited(path: str, *, windows: bool = sys.platform == "win32") -> str:
+    """The path as Windows takes it however long it is; what lies under it may have been made by others."""
+    if not windows:
+        return path
+    whole = ntpath.abspath(path)
+    if whole.startswith("\\\\?\\"):
+        return whole
+    return "\\\\?\\UNC" + whole[1:] if whole.startswith("\\\\") else "\\\\?\\" + whole
 
 
 def write_json(path: Path, content: dict[str, object]) -> None:
@@ -172,8 +223,13 @@ def _is_empty_folder(folder: Path) -> bool:
 
 
 def _size_bytes(folder: Path) -> int:
-    files = (Path(place, name) for place, _, names in os.walk(folder) for name in names)
-    return sum(path.lstat().st_size for path in files)
+    """Of the files in it; one that goes away meanwhile counts nothing."""
+    size = 0
+    for place, _, names in os.walk(unlimited(str(folder))):
+        for name in names:
+            with suppress(OSError):
+                size += os.lstat(os.path.join(place, name)).st_size
+    return size
 
 
 def _not_writable(folder: Path, error: OSError) -> Exception:

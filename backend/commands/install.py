@@ -9,6 +9,7 @@ import hashlib
 import os
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 
 from ..doctor import DEPENDENCIES
@@ -21,6 +22,7 @@ from ..wire.speaker import Speaker
 from . import environment_folder as folders
 from .cancelling import CancelRequest
 from .child import run_child
+from .computers import check_computer
 from .installer import Installer
 from .packages import install_packages, pip_environment
 from .reconstruct import converse, say_last
@@ -80,6 +82,9 @@ def _install(plan: Plan, request: CancelRequest, speaking: Speaker) -> None:
             stages=_STAGES,
         )
         if plan.again or not _is_ready(plan, installer):
+            if plan.requirements_file is None:
+                check_computer()
+            folders.check_length(plan.folder)
             folders.check_space(plan.folder, plan.build)
             _make(plan, installer)
     say_last(speaking, protocol.Finished(output=str(plan.folder), files=()))
@@ -107,16 +112,16 @@ def _make(plan: Plan, installer: Installer) -> None:
     wanted, note = _wanted(plan), begun_for(plan)
     is_continued = folders.begin_part(part, note)
     try:
-        checks = _fill(plan, wanted, installer)
+        build, checks = _fill(plan, wanted, installer)
     except ReconstructionError as error:
         if not is_continued or error.code is not ErrorCode.MISSING_DEPENDENCY:
             raise
         folders.remove(part)
         folders.begin_part(part, note)
-        checks = _fill(plan, wanted, installer)
-    record = {**note, "fewview": VERSION, "made": datetime.now(UTC).isoformat(timespec="seconds")}
+        build, checks = _fill(plan, wanted, installer)
+    made = {"torch_build": build, "fewview": VERSION, "made": datetime.now(UTC).isoformat(timespec="seconds")}
     versions = {check.name: check.found for check in checks}
-    folders.write_json(part / RECORD, {**record, "found": versions})
+    folders.write_json(part / RECORD, {**note, **made, "found": versions})
     if warning := folders.put_in_place(part, plan.folder):
         installer.warn(warning)
 
@@ -133,26 +138,42 @@ def begun_for(plan: Plan) -> dict[str, object]:
     }
 
 
-def _fill(plan: Plan, wanted: tuple[str, ...], installer: Installer) -> list[protocol.Checked]:
-    """The three steps, in DIR.part; what the check found. Raises ReconstructionError."""
+def _fill(plan: Plan, wanted: tuple[str, ...], installer: Installer) -> tuple[str, list[protocol.Checked]]:
+    """The three steps, in DIR.part; the build of torch that came, and what the check found."""
     part = beside(plan.folder, PART)
     installer.begin("python")
     if not works(part, installer):
         make_environment(part, installer)
     installer.begin("packages")
-    constraints = ROOT / CONSTRAINTS
-    install_packages(
-        python_in(part),
-        wanted,
-        constraints=constraints if constraints.is_file() else None,
-        build=plan.build,
-        installer=installer,
-    )
+    build = _install_packages(plan, wanted, installer)
     installer.begin("check")
     checks = _check(part, installer)
-    if plan.build == "cuda" and "cuda" not in {check.name for check in checks}:
-        installer.warn("No GPU by NVIDIA was found: this environment computes on the processor.")
-    return checks
+    gpu = next((check for check in checks if check.name == "cuda"), None)
+    if build == "cuda" and (gpu is None or not gpu.fine):
+        why = f"The GPU cannot be used ({gpu.found})" if gpu else "No GPU by NVIDIA was found"
+        installer.warn(f"{why}: this environment computes on the processor.")
+    return build, checks
+
+
+def _install_packages(plan: Plan, wanted: tuple[str, ...], installer: Installer) -> str:
+    """The second step; the build of torch that there is now, "default" where the other cannot be fetched."""
+    constraints = ROOT / CONSTRAINTS
+    install_with = partial(
+        install_packages,
+        python_in(beside(plan.folder, PART)),
+        wanted,
+        constraints=constraints if constraints.is_file() else None,
+        installer=installer,
+    )
+    if install_with(build=plan.build):
+        return plan.build
+    installer.warn(
+        f"The {plan.build.upper()} build of torch could not be chosen, because uv or its package index is "
+        "out of reach; the usual build of the package index is installed."
+    )
+    folders.check_space(plan.folder, "default")
+    install_with(build="default")
+    return "default"
 
 
 def _check(folder: Path, installer: Installer) -> list[protocol.Checked]:

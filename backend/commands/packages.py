@@ -5,7 +5,8 @@ pip hold, whether in variables or in files. Standard library only.
 """
 
 import ast
-from collections.abc import Mapping, Sequence
+import re
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 from ..errors import ErrorCode, ReconstructionError
@@ -23,21 +24,25 @@ _FOR_UV = {
     "extra-index-url": "UV_INDEX",
     "find-links": "UV_FIND_LINKS",
     "cert": "SSL_CERT_FILE",
+    "proxy": "HTTPS_PROXY",
+    "trusted-host": "UV_INSECURE_HOST",
 }
 """Settings of pip, and the variables in which uv takes the same."""
-_NETWORK_WORDS = (
-    "connection",
-    "name resolution",
-    "name or service not known",
-    "getaddrinfo",
-    "timed out",
-    "proxy",
-    "ssl",
-    "max retries",
-    "dns error",
-    "network",
-    "error sending request",
-    "could not fetch url",
+_LISTS = {"UV_INDEX": " ", "UV_FIND_LINKS": ",", "UV_INSECURE_HOST": " "}
+"""Those that may be several, and what uv puts between them."""
+_REASON = re.compile(
+    r"\s*(?:(?:[\w.]*(?:error|exception)|caused by|cause|note):|[×├╰]"
+    # for the last time: before that, an answer may have come
+    r"|WARNING: Retrying (?!\(Retry\(total=[1-9]))",
+    re.IGNORECASE,
+)
+"""Lines in which pip, an exception or uv says why it failed; the others name packages and files."""
+_NETWORK = re.compile(
+    r"(?<![\w/\\.-])"  # whole words, and not of a path
+    r"(?:connection|name resolution|name or service not known|getaddrinfo|timed out|proxy|ssl\w*|max retries|"
+    r"dns error|network|error sending request|response body|http error|http status)"
+    r"\b",
+    re.IGNORECASE,
 )
 _SHOWN_LINES = 12
 _NO_SPACE_WORDS = ("no space left", "errno 28", "not enough space", "disk quota")
@@ -56,25 +61,27 @@ def install_packages(
     constraints: Path | None,
     build: str,
     installer: Installer,
-) -> None:
-    """Install the requirements with the chosen build of torch.
+) -> bool:
+    """Install the requirements with this build of torch; whether its index could be reached.
 
-    Where uv or its index is out of reach it warns and takes the build that pip offers. Raises
-    ReconstructionError, with the end of what pip wrote, where it fails.
+    False only of a build that uv chooses, where uv or its index is out of reach: then "default" may do.
+    Raises ReconstructionError, with the end of what pip or uv wrote, where anything else fails.
     """
     wanted = [*(("--constraint", str(constraints)) if constraints else ()), *requirements]
     pip = [str(python), "-m", "pip"]
     if build in _BACKENDS:
+        if not installer.run([*pip, "install", "--progress-bar", "off", "uv"]):
+            return False
         if _by_uv(python, wanted, build=build, count=len(requirements), installer=installer):
-            return
-        installer.warn(
-            f"The {build.upper()} build of torch could not be chosen, because uv or its package index is out "
-            "of reach; the usual build of the package index is installed."
-        )
+            return True
+        if is_out_of_reach(installer.tail):
+            return False
+        raise explain(list(installer.tail))
     bar = "raw" if _has_raw_progress(pip, installer) else "off"
     command = [*pip, "install", "--progress-bar", bar, *wanted]
     if not _install(command, len(requirements), installer):
         raise explain(list(installer.tail))
+    return True
 
 
 def explain(tail: Sequence[str]) -> ReconstructionError:
@@ -85,7 +92,7 @@ def explain(tail: Sequence[str]) -> ReconstructionError:
         return ReconstructionError(
             ErrorCode.DISK_FULL, "The disk is full.", "Free some space and install again: it goes on."
         )
-    if any(words in lowered for words in _NETWORK_WORDS):
+    if is_out_of_reach(tail):
         text = "The packages could not be fetched: the package index is out of reach."
         remedy = (
             "Check the network, and set HTTPS_PROXY or pip's own settings where a proxy is needed; "
@@ -97,10 +104,13 @@ def explain(tail: Sequence[str]) -> ReconstructionError:
     return ReconstructionError(ErrorCode.MISSING_DEPENDENCY, f"{text}\n{said}".rstrip(), remedy)
 
 
+def is_out_of_reach(tail: Iterable[str]) -> bool:
+    """Whether pip or uv failed because of the network, from the end of what it wrote."""
+    return any(_NETWORK.search(line) for line in tail if _REASON.match(line))
+
+
 def _by_uv(python: Path, wanted: Sequence[str], *, build: str, count: int, installer: Installer) -> bool:
     """Whether uv could install what is wanted."""
-    if not installer.run([str(python), "-m", "pip", "install", "--progress-bar", "off", "uv"]):
-        return False
     uv = [str(python), "-m", "uv", "pip", "install", "--python", str(python)]
     command = [*uv, "--torch-backend", _BACKENDS[build], *wanted]
     return _install(command, count, installer, changes=_settings_for_uv(python, installer))
@@ -139,8 +149,9 @@ def _settings_for_uv(python: Path, installer: Installer) -> dict[str, str]:
     installer.ask([str(python), "-m", "pip", "config", "list"])
     settings = pip_settings(installer.tail)
     found = {variable: settings[name] for name, variable in _FOR_UV.items() if name in settings}
-    if "UV_FIND_LINKS" in found:
-        found["UV_FIND_LINKS"] = ",".join(found["UV_FIND_LINKS"].split())
+    for name, separator in _LISTS.items():
+        if name in found:
+            found[name] = separator.join(found[name].split())
     return {name: value for name, value in found.items() if name not in installer.environment}
 
 

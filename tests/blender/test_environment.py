@@ -16,7 +16,7 @@ from typing import Any
 import fake_layout
 import pytest
 
-from tests.stand_in_packages import write_wheels
+from tests.stand_in_packages import write_uv, write_wheels
 
 bpy = pytest.importorskip("bpy", reason="needs Blender's Python, where `import bpy` works")
 
@@ -133,6 +133,31 @@ def test_an_environment_whose_python_was_removed_is_said(environment: Any, tmp_p
         environment.find_python(variable="", preference="", managed=tmp_path)
 
 
+@pytest.mark.parametrize(
+    ("windows", "variables", "expected"),
+    [
+        (True, {"LOCALAPPDATA": "/local"}, Path("/local/fewview")),
+        (True, {}, None),
+        (False, {"LOCALAPPDATA": "/local"}, None),
+    ],
+)
+def test_on_windows_the_managed_one_has_a_short_path(
+    environment: Any, windows: bool, variables: dict[str, str], expected: Path | None
+) -> None:
+    assert environment.short_folder(variables, windows=windows) == expected
+
+
+def test_the_managed_one_goes_where_it_is_chosen_else_short_else_to_blenders_folder(
+    preferences: Any, operators: Any, environment: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(environment, "short_folder", lambda _: tmp_path / "short")
+    assert operators.managed_folder(bpy.context) == tmp_path / "managed" / "environment"
+    preferences.environment_folder = ""
+    assert operators.managed_folder(bpy.context) == tmp_path / "short" / "environment"
+    monkeypatch.undo()
+    assert operators.managed_folder(bpy.context) == operators.user_folder() / "environment"
+
+
 # By hand.
 
 
@@ -180,6 +205,20 @@ def test_readiness_is_of_one_python_as_it_was(environment: Any, tmp_path: Path) 
     assert environment.readiness(touch(tmp_path / "other")).state is environment.State.UNKNOWN
     os.utime(tmp_path / "pyvenv.cfg", ns=(1, 1))  # made anew
     assert environment.readiness(python).state is environment.State.UNKNOWN
+
+
+def test_a_gpu_that_fails_is_told_beside_ready(environment: Any, tmp_path: Path) -> None:
+    """The check says ready; the CPU is what it computes on."""
+    checks = [
+        checked(environment, "torch", "2.13.0"),
+        checked(environment, "cuda", "GTX 1080: no code for it", fine=False),
+        checked(environment, "cpu", "2 cores"),
+    ]
+    python = touch(tmp_path / "python")
+    environment.remember(python, checks, finished=True)
+    known = environment.readiness(python)
+    assert known.state is environment.State.READY
+    assert known.text == "torch 2.13.0, CPU 2 cores; CUDA fails: GTX 1080: no code for it"
 
 
 def test_what_is_missing_is_named(environment: Any, tmp_path: Path) -> None:
@@ -260,6 +299,7 @@ def test_one_is_made_used_and_removed(
         environment.__name__.replace("addon.environment", "backend.doctor")
     )
     write_wheels(tmp_path / "wheels", dependencies.DEPENDENCIES)
+    write_uv(tmp_path / "wheels")
     monkeypatch.setenv("PIP_NO_INDEX", "1")
     monkeypatch.setenv("PIP_FIND_LINKS", str(tmp_path / "wheels"))
     code = Path(environment.__file__).parents[1]
@@ -307,6 +347,8 @@ def test_the_lines_are_copied(
     folder = tmp_path / "fewview-environment"
     lines = environment.hand_lines(folder)
     assert "Python 3.12" in said
+    assert f"Run them in {environment.shell_name()}, where" in said
+    assert environment.shell_name(windows=True) == "the Command Prompt (cmd)"  # as hand_lines quotes
     assert "3.12" in lines.split()[0 if sys.platform != "win32" else 1]
     assert str(environment.python_in(folder)) in said
     assert lines.splitlines()[1].startswith(shlex.quote(str(environment.python_in(folder))))
@@ -360,6 +402,7 @@ def test_the_words_of_the_preferences_have_no_jargon(preferences: Any, operators
     chosen = properties["torch_build"].enum_items
     assert chosen.keys() == ["cpu", "default", "cuda"]  # saved in users' preferences
     for items in (asked, chosen):
+        assert "every computer" not in items["cpu"].description
         assert (items["default"].name, "index" in items["default"].description) == ("Standard", False)
 
 
@@ -390,6 +433,12 @@ def test_the_zip_holds_what_is_needed_and_nothing_else(extension_zip: Path) -> N
     }
     assert {"backend/wire/client.py", "addon/operators/environment.py"} <= set(names)
     assert not [name for name in names if "__pycache__" in name or name.endswith((".pyc", ".blend"))]
+
+
+def test_it_is_offered_to_the_computers_that_it_can_be_set_up_on() -> None:
+    """As Blender names them; backend/commands/computers.py refuses the others."""
+    with (ROOT / "blender_manifest.toml").open("rb") as file:
+        assert tomllib.load(file)["platforms"] == ["windows-x64", "macos-arm64", "linux-x64"]
 
 
 def test_permissions_say_what_for_in_a_line_that_blender_takes() -> None:

@@ -7,9 +7,10 @@ from pathlib import Path
 
 import pytest
 
-from backend import doctor
+from backend import doctor, machine
 from backend.doctor import Check
 from backend.errors import ErrorCode
+from backend.machine import SeenDevice
 from backend.wire import protocol
 from backend.wire.client import ROOT, WireProcess, backend_command
 from backend.wire.protocol import Checked, Failed, Finished, Hello, Message, decode
@@ -26,7 +27,7 @@ def conversation(*python: str) -> tuple[int, list[Message]]:
 
 
 def checks(*faulty: str) -> list[Check]:
-    names = ["Python", *doctor.DEPENDENCIES.values(), "compiled code", "cuda", "cpu"]
+    names = ["Python", *doctor.DEPENDENCIES.values(), "compiled code", "cuda", "mps", "cpu"]
     return [Check(name=name, fine=name not in faulty, found="?") for name in names]
 
 
@@ -75,7 +76,7 @@ def test_devices_are_left_out_where_a_package_is_missing(monkeypatch: pytest.Mon
     [
         (("torch", "rich"), ErrorCode.MISSING_DEPENDENCY, "torch (?); also rich"),
         (("Python",), ErrorCode.MISSING_DEPENDENCY, "Python (?)"),
-        (("cuda",), ErrorCode.DEVICE_UNAVAILABLE, "cuda (?)"),
+        (("cuda", "cpu"), ErrorCode.DEVICE_UNAVAILABLE, "cannot reconstruct: cpu (?)."),
     ],
 )
 def test_faults_are_named_by_kind(faulty: tuple[str, ...], code: ErrorCode, words: str) -> None:
@@ -91,11 +92,39 @@ def test_faults_are_named_by_kind(faulty: tuple[str, ...], code: ErrorCode, word
         (("Python", "torch"), "take Python 3.11 or a later one"),
         (("torch", "compiled code"), f"`{sys.executable} -m pip install --constraint constraints.txt .`"),
         (("compiled code",), "report it"),
-        (("cuda",), "update the driver of cuda, or compute with `--device cpu`"),
+        (("cuda", "cpu"), "report it"),
+        (("cuda",), "ready, but not on cuda: compute with `--device cpu`"),
+        (("cuda", "mps"), "ready, but not on cuda and mps: compute"),
     ],
 )
 def test_the_remedy_in_a_shell_is_that_of_the_first_fault(faulty: tuple[str, ...], words: str) -> None:
     assert words in doctor.as_text(checks(*faulty)).splitlines()[-1]
+
+
+@pytest.mark.parametrize("part", ["Python", "torch", "compiled code", "cpu"])
+def test_all_but_a_gpu_is_needed(part: str) -> None:
+    assert doctor.is_ready(checks("cuda", "mps"))
+    assert not doctor.is_ready(checks(part))
+
+
+def test_a_gpu_that_fails_is_told_and_the_cpu_stays(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whether that is known before, as of one that torch has no code for, or found out by a computation."""
+    old = SeenDevice(kind="cuda", name="GTX 1080", fault="no code for it")
+    full = SeenDevice(kind="cuda", name="RTX 5090")
+    cpu = SeenDevice(kind="cpu", name="2 cores")
+
+    def solve(kind: str) -> float:
+        if kind == "cuda":
+            raise RuntimeError("CUDA error: out of memory\nCompile with TORCH_USE_CUDA_DSA")
+        return 0.0
+
+    monkeypatch.setattr(doctor, "_gradient_error", solve)
+    for gpu, found in ((old, "GTX 1080: no code for it"), (full, "RTX 5090: CUDA error: out of memory")):
+        monkeypatch.setattr(machine, "seen_devices", lambda gpu=gpu: (gpu, cpu))
+        assert list(doctor._check_devices()) == [
+            Check(name="cuda", fine=False, found=found),
+            Check(name="cpu", fine=True, found="2 cores"),
+        ]
 
 
 def test_it_can_be_cancelled(tmp_path: Path) -> None:

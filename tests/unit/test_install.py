@@ -15,16 +15,27 @@ import textwrap
 import threading
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from importlib.metadata import distribution
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
 from backend.commands import environment_folder as folders
+from backend.commands import install
+from backend.commands.cancelling import CancelRequest
+from backend.commands.computers import reason_against
 from backend.commands.install import Plan, begun_for
 from backend.commands.install_progress import TEXT_LENGTH, InstallProgress, shortened
-from backend.commands.packages import explain, pip_environment, pip_settings
+from backend.commands.packages import (
+    _settings_for_uv,
+    explain,
+    install_packages,
+    pip_environment,
+    pip_settings,
+)
 from backend.doctor import DEPENDENCIES
 from backend.errors import ErrorCode, ReconstructionError
 from backend.wire import protocol
@@ -40,7 +51,7 @@ from backend.wire.environment import (
     sizes_gb,
 )
 from backend.wire.protocol import Checked, Failed, Finished, Message, Progress, Stage, Warned
-from tests.stand_in_packages import constrained_version, write_wheel, write_wheels
+from tests.stand_in_packages import constrained_version, write_uv, write_wheels
 
 posix_only = pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX")
 
@@ -388,19 +399,7 @@ def test_a_build_that_uv_can_not_fetch_is_the_usual_one(case: Case) -> None:
     heard = case.run("--torch", "cpu")
     assert isinstance(heard[-1], Finished), heard[-1]
     assert any("CPU build" in message.text for message in heard if isinstance(message, Warned))
-
-
-FAKE_UV = """
-import os, subprocess, sys
-words = sys.argv[1:]
-assert words[:2] == ["pip", "install"], words
-assert os.environ["UV_FIND_LINKS"] == ",".join(os.environ["PIP_FIND_LINKS"].split())
-assert words[words.index("--torch-backend") + 1] == "cpu"
-assert words[words.index("--python") + 1] == sys.executable
-del words[words.index("--torch-backend"):][:2]
-rest = words[words.index("--constraint"):]
-sys.exit(subprocess.run([sys.executable, "-m", "pip", "install", *rest]).returncode)
-"""
+    assert json.loads((case.folder / RECORD).read_text())["torch_build"] == "default"
 
 
 @pytest.mark.slow
@@ -409,7 +408,7 @@ def test_a_build_is_chosen_by_uv_with_the_settings_of_pip(case: Case) -> None:
     case.begin()
     (case.part / MARKER).write_text(json.dumps({**case.note(), "torch_build": "cpu"}))
     (case.place / "more").mkdir()
-    write_wheel(case.place / "more", "uv", "1.0", module="uv", code=FAKE_UV)
+    write_uv(case.place / "more")
     case.index["PIP_FIND_LINKS"] += f" {case.place / 'more'}"
     case.index["PIP_INDEX_URL"] = "http://me:secret@127.0.0.1:9/simple"
     heard = case.run("--torch", "cpu")
@@ -417,6 +416,158 @@ def test_a_build_is_chosen_by_uv_with_the_settings_of_pip(case: Case) -> None:
     assert not [message for message in heard if isinstance(message, Warned)]
     assert json.loads((case.folder / RECORD).read_text())["torch_build"] == "cpu"
     assert "secret" not in (case.place / "install.log").read_text()
+
+
+class PlayedInstaller:
+    """Programs that are not run: whether each ends well, and what it writes, by a word of its command."""
+
+    def __init__(self, **said: tuple[bool, str]) -> None:
+        self.said = said
+        self.ran: list[str] = []
+        self.warned: list[str] = []
+        self.tail: list[str] = []
+        self.environment: dict[str, str] = {}
+
+    def run(self, command: list[str], **_: object) -> bool:
+        program = "fetch_uv" if command[-1] == "uv" else command[2]
+        self.ran.append(program)
+        fine, text = self.said.get(program, (True, ""))
+        self.tail = text.splitlines()
+        return fine
+
+    def ask(self, command: list[str]) -> bool:
+        self.tail = self.said.get(command[3], (True, "pip 26.0 from here"))[1].splitlines()
+        return True
+
+    def begin(self, stage: str) -> None:
+        pass
+
+    def warn(self, text: str) -> None:
+        self.warned.append(text)
+
+
+def install_in(installer: PlayedInstaller, build: str) -> bool:
+    given: Any = installer
+    return install_packages(Path("py"), ["torch>=2.6"], constraints=None, build=build, installer=given)
+
+
+UV_UNREACHABLE = """\
+error: Request failed after 1 retry in 1.5s
+  cause: Failed to fetch: https://download.pytorch.org/whl/cpu/torch/
+  cause: error sending request for url (https://download.pytorch.org/whl/cpu/torch/)
+  cause: client error (Connect)"""
+UV_NO_SOLUTION = """\
+error: No solution found when resolving dependencies
+  cause: Because only networkx<=3.7 is available and you require networkx>=300, it can not be."""
+UV_FULL = """\
+error: Failed to extract archive: torch-2.13.0+cu130-cp312-cp312-manylinux_2_28_x86_64.whl
+  cause: No space left on device (os error 28)"""
+
+
+@pytest.mark.parametrize(
+    ("build", "said", "ran", "reached"),
+    [
+        ("default", {}, ["pip"], True),
+        ("cuda", {}, ["fetch_uv", "uv"], True),
+        ("cuda", {"fetch_uv": (False, "")}, ["fetch_uv"], False),
+        ("cuda", {"uv": (False, UV_UNREACHABLE)}, ["fetch_uv", "uv"], False),
+    ],
+)
+def test_another_build_is_for_where_uv_is_out_of_reach(
+    build: str, said: dict[str, tuple[bool, str]], ran: list[str], reached: bool
+) -> None:
+    installer = PlayedInstaller(**said)
+    assert install_in(installer, build) == reached
+    assert installer.ran == ran
+
+
+@pytest.mark.parametrize(
+    ("said", "code", "words"),
+    [
+        (UV_FULL, ErrorCode.DISK_FULL, "disk is full"),
+        (UV_NO_SOLUTION, ErrorCode.MISSING_DEPENDENCY, "No solution"),
+    ],
+)
+def test_any_other_failure_of_uv_is_one(said: str, code: ErrorCode, words: str) -> None:
+    """Not a reason for gigabytes of another build."""
+    installer = PlayedInstaller(uv=(False, said))
+    with pytest.raises(ReconstructionError, match=words) as caught:
+        install_in(installer, "cuda")
+    assert caught.value.code is code
+    assert installer.ran == ["fetch_uv", "uv"]
+
+
+@pytest.fixture
+def without_uv(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Plan:
+    """An installation of the CUDA build that gets the usual one, on a computer where no GPU is found."""
+    monkeypatch.setattr(install, "install_packages", lambda *_, build, **__: build == "default")
+    monkeypatch.setattr(install, "works", lambda *_: True)
+    monkeypatch.setattr(install, "_check", lambda *_: [Checked(name="cpu", fine=True, found="2 cores")])
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=100e9))
+    return Plan(folder=tmp_path / "e", build="cuda")
+
+
+def fill(plan: Plan) -> tuple[str, list[str]]:
+    """The build that there is in the end, and the warnings."""
+    installer: Any = PlayedInstaller()
+    return install._fill(plan, (), installer)[0], installer.warned
+
+
+def test_the_build_that_there_is_in_the_end_is_known(without_uv: Plan) -> None:
+    """And no GPU is missed by one that does without."""
+    build, (warned,) = fill(without_uv)
+    assert build == "default"
+    assert "CUDA build of torch could not be chosen" in warned
+
+
+def test_for_another_build_the_disk_is_looked_at_again(
+    without_uv: Plan, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With CUDA it is four times as large."""
+    monkeypatch.setattr(sys, "platform", "linux")
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=needed_bytes("cpu")))
+    with pytest.raises(ReconstructionError, match=r"needs about 11\.5 GB"):
+        fill(replace(without_uv, build="cpu"))
+
+
+@pytest.mark.parametrize(
+    ("gpu", "words"),
+    [
+        ([], ["No GPU by NVIDIA was found: "]),
+        ([Checked(name="cuda", fine=True, found="H200")], []),
+        (
+            [Checked(name="cuda", fine=False, found="GTX 1080: no code")],
+            ["cannot be used (GTX 1080: no code): "],
+        ),
+    ],
+)
+def test_the_build_for_a_gpu_without_one_that_works_is_told(
+    without_uv: Plan, monkeypatch: pytest.MonkeyPatch, gpu: list[Checked], words: list[str]
+) -> None:
+    monkeypatch.setattr(install, "install_packages", lambda *_, **__: True)
+    monkeypatch.setattr(install, "_check", lambda *_: gpu)
+    build, warned = fill(without_uv)
+    assert build == "cuda"
+    assert len(warned) == len(words)
+    assert all(word in text for word, text in zip(words, warned, strict=True))
+
+
+def test_uv_gets_the_settings_of_pip_that_it_knows() -> None:
+    lines = """\
+global.index-url='https://m/simple'
+global.extra-index-url='https://a/simple\\nhttps://b/simple'
+global.proxy='http://proxy.firm:3128'
+install.trusted-host='pypi.org files.pythonhosted.org'
+global.cert='/of mine/cert.pem'
+global.timeout='60'"""
+    installer: Any = PlayedInstaller(config=(True, lines))
+    installer.environment["UV_DEFAULT_INDEX"] = "uv's own comes first"
+    assert _settings_for_uv(Path("py"), installer) == {
+        "UV_INDEX": "https://a/simple https://b/simple",
+        "HTTPS_PROXY": "http://proxy.firm:3128",
+        "UV_INSECURE_HOST": "pypi.org files.pythonhosted.org",
+        "SSL_CERT_FILE": "/of mine/cert.pem",
+    }
 
 
 # Whose folders.
@@ -528,6 +679,117 @@ def test_a_small_disk_is_told_before_anything_is_made(
     folders.check_space(folder, "cpu")
 
 
+# Computers that there are no packages for.
+
+
+@pytest.mark.parametrize(
+    ("system", "machine", "macos", "words"),
+    [
+        ("win32", "win-amd64", "", ""),
+        ("win32", "win-arm64", "", "not made for the processor win-arm64"),
+        ("darwin", "arm64", "14.0", ""),
+        ("darwin", "arm64", "26.1", ""),
+        ("darwin", "arm64", "", ""),  # which is not known
+        ("darwin", "arm64", "13.7.1", "not made for macOS 13.7.1"),
+        ("darwin", "x86_64", "15.2", "not made for Blenders and Macs for Intel"),  # also on Apple silicon
+        ("linux", "x86_64", "", ""),
+        ("linux", "aarch64", "", "not made for the processor aarch64"),
+        ("freebsd14", "amd64", "", ""),
+    ],
+)
+def test_where_there_are_no_packages_is_known(system: str, machine: str, macos: str, words: str) -> None:
+    reason = reason_against(system, machine, macos)
+    assert words in reason
+    assert bool(reason) == bool(words)
+
+
+def test_where_there_are_none_nothing_is_begun(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(install, "_make", lambda *_: pytest.fail("it began"))
+    monkeypatch.setattr("platform.machine", lambda: "ppc64")
+    monkeypatch.setattr("sys.platform", "linux")
+    plan = Plan(folder=tmp_path / "environment")
+    with pytest.raises(ReconstructionError, match=r"cannot be set up here: .* ppc64") as caught:
+        install._install(plan, CancelRequest(), SimpleNamespace(say=lambda _: None))  # type: ignore[arg-type]
+    assert "Apple silicon" in caught.value.remedy
+
+
+# Windows takes no long paths.
+
+ROAMING = "C:/Users/max/AppData/Roaming/Blender Foundation/Blender/4.5/extensions/.user/user_default/fewview"
+LOCAL = "C:/Users/nineteen characters/AppData/Local/fewview"
+
+
+@pytest.mark.parametrize(("place", "fits"), [(ROAMING, False), (LOCAL, True), (LOCAL + "X", False)])
+def test_a_folder_that_is_too_deep_for_windows_is_refused(
+    place: str, fits: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = Path(place) / "environment"
+    folders.check_length(folder)  # where paths have no such limit
+    monkeypatch.setattr(folders, "takes_long_paths", lambda: False)
+    if fits:
+        folders.check_length(folder)
+        return
+    with pytest.raises(ReconstructionError, match="characters too long") as caught:
+        folders.check_length(folder)
+    assert "shorter Environment Folder" in caught.value.remedy
+
+
+def test_that_is_said_before_anything_is_made(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nor is anything fetched."""
+    monkeypatch.setattr(folders, "takes_long_paths", lambda: False)
+    monkeypatch.setattr("backend.commands.install._make", lambda *_: pytest.fail("it began"))
+    plan = Plan(folder=tmp_path / ("deep" * 40) / "environment")
+    with pytest.raises(ReconstructionError, match="characters too long"):
+        install._install(plan, CancelRequest(), SimpleNamespace(say=lambda _: None))  # type: ignore[arg-type]
+
+
+def test_no_package_has_longer_names_than_are_reckoned_with() -> None:
+    """Of torch as it is here: other builds have another name, at most that with "+cu130"."""
+    found = [distribution(name) for name in DEPENDENCIES.values()]
+    torch = distribution("torch").version
+    longest_build = f"torch-{torch.partition('+')[0]}+cu130."
+    names = [str(path) for package in found for path in package.files or ()]
+    assert max(len(name.replace(f"torch-{torch}.", longest_build)) for name in names) == folders._LONGEST_NAME
+
+
+@pytest.mark.parametrize(
+    ("path", "whole"),
+    [
+        (r"C:\a\..\b c", r"\\?\C:\b c"),
+        (r"\\server\share\a", r"\\?\UNC\server\share\a"),
+        (r"\\?\C:\a", r"\\?\C:\a"),
+    ],
+)
+def test_long_paths_are_spelled_as_windows_takes_them(path: str, whole: str) -> None:
+    assert folders.unlimited(path, windows=True) == whole
+    assert folders.unlimited(path, windows=False) == path
+
+
+def test_what_was_begun_is_measured_and_removed_however_deep(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As on Windows, where files under the plain path cannot be reached: here they lie elsewhere."""
+    plain = ours(tmp_path / "e.part", "")
+    (plain / "content").unlink()
+    deep = ours(tmp_path / "deep", "1234")
+    (deep / "a").mkdir()
+    monkeypatch.setattr(folders, "unlimited", lambda _: str(deep))
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=needed_bytes("cpu") - 4))
+    folders.check_space(tmp_path / "e", "cpu")
+    folders.remove(plain)
+    assert [entry.name for entry in deep.iterdir()] == [MARKER]
+    assert not plain.exists()
+
+
+def test_a_file_that_goes_away_while_it_is_measured_is_no_failure(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    part = ours(tmp_path / "e.part", "1234")
+    monkeypatch.setattr(os, "walk", lambda _: [(str(part), [], ["gone", "content"])])
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=needed_bytes("cpu") - 4))
+    folders.check_space(tmp_path / "e", "cpu")
+
+
 def test_unknown_builds_are_refused(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="unknown build 'rocm'"):
         Plan(folder=tmp_path, build="rocm")
@@ -594,7 +856,6 @@ def test_texts_are_cut() -> None:
     ("line", "code", "words"),
     [
         ("ERROR: [Errno 28] No space left on device", ErrorCode.DISK_FULL, "disk is full"),
-        ("Failed to establish a new connection: [Errno 111]", ErrorCode.MISSING_DEPENDENCY, "out of reach"),
         ("ERROR: No matching distribution found for x", ErrorCode.MISSING_DEPENDENCY, "No matching"),
     ],
 )
@@ -602,6 +863,71 @@ def test_failures_of_pip_are_explained(line: str, code: ErrorCode, words: str) -
     error = explain(["before", line])
     assert error.code is code
     assert words in error.text
+
+
+COLLECTED = """\
+Collecting scikit-image>=0.24
+  Downloading scikit_image-0.26.0-cp311-cp311-win_amd64.whl.metadata (15 kB)
+Collecting networkx>=3.0 (from scikit-image>=0.24)
+  Downloading networkx-3.6.1-py3-none-any.whl.metadata (6.8 kB)
+Installing collected packages: mpmath, networkx, torch"""
+RETRYING = (
+    "WARNING: Retrying (Retry(total={}, connect=None, read=None, redirect=None, status=None)) after "
+    "connection broken by 'NewConnectionError('<pip._vendor.urllib3.connection.HTTPConnection object>: "
+    "Failed to establish a new connection: [Errno 111] Connection refused')': /simple/numpy/"
+)
+DENIED = r"""
+ERROR: Could not install packages due to an OSError: [WinError 5] Access is denied: 'C:\e\torch\fx\proxy.py'
+Check the permissions."""
+NOTHING_FOUND = """
+ERROR: Could not find a version that satisfies the requirement numpy>=1.26 (from versions: none)
+ERROR: No matching distribution found for numpy>=1.26"""
+CONFLICT = """
+ERROR: Cannot install numpy because these package versions have conflicting dependencies."""
+TOO_OLD = """
+ERROR: Could not find a version that satisfies the requirement networkx>=9 (from versions: 3.5, 3.6.1)
+ERROR: No matching distribution found for networkx>=9"""
+BROKEN_OFF = """
+ERROR: Exception:
+Traceback (most recent call last):
+  File "/e/pip/_vendor/urllib3/response.py", line 438, in _error_catcher
+pip._vendor.urllib3.exceptions.ReadTimeoutError: HTTPSConnectionPool(host='files'): Read timed out."""
+INCOMPLETE = """
+error: incomplete-download
+
+× Download failed because not enough bytes were received (0.8 MB/890 MB)
+╰─> URL: https://files/torch.whl
+
+note: This is an issue with network connectivity, not pip."""
+UV_OLDER = """\
+  × Failed to download `torch==2.13.0`
+  ├─▶ Failed to fetch: `https://download.pytorch.org/whl/cpu/torch.whl`
+  ╰─▶ operation timed out"""
+
+
+@pytest.mark.parametrize(
+    ("said", "expected"),
+    [
+        pytest.param(COLLECTED + DENIED, False, id="a file is held"),
+        pytest.param(
+            f"{RETRYING.format(4)}\n{COLLECTED}{DENIED}", False, id="answered in the end, then a file is held"
+        ),
+        pytest.param(COLLECTED + TOO_OLD, False, id="no such version"),
+        pytest.param(RETRYING.format(1) + TOO_OLD, False, id="answered in the end, no such version"),
+        pytest.param(RETRYING.format(0) + NOTHING_FOUND, True, id="never answered"),
+        pytest.param(RETRYING.format(0) + CONFLICT, True, id="never answered, with constraints"),
+        pytest.param(COLLECTED + BROKEN_OFF, True, id="broken off"),
+        pytest.param(COLLECTED + INCOMPLETE, True, id="incomplete"),
+        pytest.param(UV_UNREACHABLE, True, id="uv never answered"),
+        pytest.param(UV_OLDER, True, id="an older uv never answered"),
+        pytest.param(UV_NO_SOLUTION, False, id="uv found no version"),
+    ],
+)
+def test_the_network_is_named_only_where_it_is_to_blame(said: str, expected: bool) -> None:
+    """Not for the names of packages and files."""
+    error = explain(said.splitlines())
+    assert ("out of reach" in error.text) == expected
+    assert ("proxy" in error.remedy) == expected
 
 
 def test_the_users_settings_hold_and_nothing_leads_elsewhere() -> None:
