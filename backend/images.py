@@ -26,6 +26,9 @@ has the 3:2 shape of the film this is the same as by the width, and upright or n
 _MILLIMETRES_PER_RESOLUTION_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
 """EXIF FocalPlaneResolutionUnit: inch, centimetre, millimetre, micrometre."""
 
+_SHORTEST_FOCAL_RATIO = 0.1
+"""Of the longer side, which then spans 157 degrees. With less, as of 1 mm, no photograph is placed."""
+
 _STRIP_ROWS = 256
 """Rows of output made at a time, so that a large photograph is never held as floats at full size."""
 
@@ -128,8 +131,15 @@ def focal_px_or_none(exif: Image.Exif, width: int, height: int) -> float | None:
     """Focal length in pixels of an image of this size, from EXIF.
 
     The 35 mm equivalent counts first: it belongs to the picture as it was saved. Otherwise the focal length
-    and the density of the sensor's pixels, which are given for the size at which the camera saved.
+    and the density of the sensor's pixels, which are given for the size at which the camera saved. None where
+    there are none, or no lens is so short.
     """
+    focal_px = _told_focal_px_or_none(exif, width, height)
+    too_short = focal_px is not None and focal_px < _SHORTEST_FOCAL_RATIO * max(width, height)
+    return None if too_short else focal_px
+
+
+def _told_focal_px_or_none(exif: Image.Exif, width: int, height: int) -> float | None:
     details = exif.get_ifd(ExifTags.IFD.Exif)
     equivalent_mm = _positive_or_none(details.get(ExifTags.Base.FocalLengthIn35mmFilm))
     if equivalent_mm is not None:

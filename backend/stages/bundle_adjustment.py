@@ -5,19 +5,25 @@ import pycolmap
 
 
 def adjust_bundle(
-    model: pycolmap.Reconstruction, *, free_lens: bool, robust_scale_px: float
+    model: pycolmap.Reconstruction, *, free_lens: bool, free_focal: bool = False, robust_scale_px: float
 ) -> pycolmap.CeresBundleAdjuster:
     """Move the model's cameras and points to where they reproject best, and with `free_lens` its lenses.
 
-    Errors count by a Cauchy loss of the given scale.
+    With `free_focal` of the lenses the focal lengths alone. Errors count by a Cauchy loss of the given scale.
     """
-    adjuster = bundle_adjuster(model, free_lens=free_lens, robust_scale_px=robust_scale_px)
+    adjuster = bundle_adjuster(
+        model, free_lens=free_lens, free_focal=free_focal, robust_scale_px=robust_scale_px
+    )
     adjuster.solve()
     return adjuster
 
 
 def bundle_adjuster(
-    model: pycolmap.Reconstruction, *, free_lens: bool, robust_scale_px: float | None
+    model: pycolmap.Reconstruction,
+    *,
+    free_lens: bool,
+    free_focal: bool = False,
+    robust_scale_px: float | None,
 ) -> pycolmap.CeresBundleAdjuster:
     """The adjustment, not yet done: of all placed photographs, the first two of which hold frame and scale.
 
@@ -25,7 +31,8 @@ def bundle_adjuster(
     """
     options = pycolmap.BundleAdjustmentOptions()
     options.print_summary = False
-    options.refine_focal_length = options.refine_principal_point = options.refine_extra_params = free_lens
+    options.refine_focal_length = free_lens or free_focal
+    options.refine_principal_point = options.refine_extra_params = free_lens
     if robust_scale_px is not None:
         options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
         options.ceres.loss_function_scale = robust_scale_px

@@ -8,6 +8,7 @@ cameras and points are adjusted once more to the lens so found.
 Parameters of SIMPLE_RADIAL: focal length, principal point x, y (pixels), radial coefficient.
 """
 
+from collections.abc import Collection
 from dataclasses import dataclass
 
 import numpy as np
@@ -28,6 +29,9 @@ _FOCAL_SIGMA_WITH_EXIF = 0.05
 """Relative. EXIF rounds to millimetres and knows nothing of focusing and of digital zoom."""
 _FOCAL_SIGMA_WITHOUT = 0.35
 """Phones' and cameras' usual lenses are 0.7 to 2 longer sides; the guess is 1.2."""
+_FOCAL_SIGMA_MAPPED_WELL = 0.05
+"""Of what mapping found against EXIF, with the principal points held. Here they are free, and the lenses of
+photographs that were cropped one by one would slide together (docs/experiments.md)."""
 _CENTRE_SIGMA = 0.01
 """Of the longer side: what lenses and stabilised sensors are off by."""
 _RADIAL_SIGMA = 0.1
@@ -54,11 +58,13 @@ def joined(one: Gaussian, other: Gaussian) -> Gaussian:
     return Gaussian(mean=mean, covariance=covariance)
 
 
-def refine_lenses(model: pycolmap.Reconstruction) -> tuple[Decision, ...]:
+def refine_lenses(
+    model: pycolmap.Reconstruction, *, mapped_well: Collection[int] = ()
+) -> tuple[Decision, ...]:
     """Adjust the model and its SIMPLE_RADIAL lenses in place; say for each lens what was decided.
 
-    A lens with `has_prior_focal_length` is expected to hold that focal length. Two photographs alone say too
-    little: their lenses stay.
+    A lens with `has_prior_focal_length` is expected to hold that focal length, and one of `mapped_well` (ids)
+    what mapping found against EXIF. Two photographs alone say too little: their lenses stay.
     """
     mapped = {camera_id: np.array(camera.params) for camera_id, camera in model.cameras.items()}
     estimates = _estimates(model) if model.num_reg_images() >= 3 else {}
@@ -67,7 +73,8 @@ def refine_lenses(model: pycolmap.Reconstruction) -> tuple[Decision, ...]:
         before, estimate = mapped[camera_id], estimates.get(camera_id)
         camera.params = before
         if estimate is not None:
-            camera.params = joined(estimate, _prior(camera, before[0])).mean
+            prior = _prior(camera, before[0], mapped_well=camera_id in mapped_well)
+            camera.params = joined(estimate, prior).mean
             if camera.has_bogus_params(*_SANE_FOCAL_RATIO, _SANE_RADIAL):
                 camera.params, estimate = before, None
         decisions.append(_decision(camera, before[0], estimate))
@@ -76,9 +83,12 @@ def refine_lenses(model: pycolmap.Reconstruction) -> tuple[Decision, ...]:
     return tuple(decisions)
 
 
-def _prior(camera: pycolmap.Camera, focal_px: float) -> Gaussian:
-    """What is believed of a lens before any photograph is looked at."""
-    focal_sigma = _FOCAL_SIGMA_WITH_EXIF if camera.has_prior_focal_length else _FOCAL_SIGMA_WITHOUT
+def _prior(camera: pycolmap.Camera, focal_px: float, *, mapped_well: bool) -> Gaussian:
+    """What is believed of a lens before the adjustment."""
+    if camera.has_prior_focal_length:
+        focal_sigma = _FOCAL_SIGMA_WITH_EXIF
+    else:
+        focal_sigma = _FOCAL_SIGMA_MAPPED_WELL if mapped_well else _FOCAL_SIGMA_WITHOUT
     centre_sigma_px = _CENTRE_SIGMA * max(camera.width, camera.height)
     sigmas = [focal_sigma * focal_px, centre_sigma_px, centre_sigma_px, _RADIAL_SIGMA]
     return Gaussian(

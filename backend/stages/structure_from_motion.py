@@ -5,7 +5,7 @@ The photographs are matched without their masks: the background places cameras a
 
 import os
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Sequence, Set
 from dataclasses import dataclass
 from functools import partial
 from itertools import chain
@@ -21,6 +21,7 @@ from ..kernels.side_by_side import side_by_side
 from ..scene import Decision, Photo, Progress, Unplaced
 from .camera_evidence import camera_evidence
 from .confirmation import FEWEST_CONFIRMING, num_confirming
+from .lens_doubt import contradicted_lenses
 from .lens_refinement import refine_lenses
 from .lenses import PlacedPhoto, Placement, rigid_matrix, sparse_points
 from .parallax import require_parallax, why_none_placed, why_unplaced
@@ -140,7 +141,9 @@ def estimate_placement(
     model, database, features = _best_model(folder, groups, num_features, workdir, seed, progress)
     if model is None or model.num_reg_images() < 2:
         raise why_none_placed(database, len(photos))
-    decisions = (*features, *refine_lenses(model))
+    against_exif = _groups_against_exif(model, groups)
+    doubts = map(_why_not_exif, against_exif.values())
+    decisions = (*features, *doubts, *refine_lenses(model, mapped_well=against_exif.keys()))
     _drop_bad_points(model)
     require_parallax(model, database)
     return _placement(model, photos, decisions, database)
@@ -354,6 +357,7 @@ def _best_model(
                 break
         if not attempt.sensitive:
             best = _with_another_lens(best, database, mapped)
+            best = _without_contradicted_exif(best, database, mapped)
             best_of_usual = best
     if best is None or not extracted:
         return best, database, ()
@@ -378,9 +382,7 @@ def _with_another_lens(
     best_of_few = max(mapped(database, few), key=_merit, default=None) if few else None
 
     def begun_with(factor: float) -> list[pycolmap.Reconstruction]:
-        own = database.parent / f"begun_with_{factor:g}" / database.name
-        own.parent.mkdir(exist_ok=True)
-        shutil.copyfile(database, own)
+        own = _copied(database, f"begun_with_{factor:g}")
         _begin_with(own, factor)
         if few and not any(_is_clearly_better(of_few, best_of_few) for of_few in mapped(own, few)):
             return []
@@ -391,6 +393,34 @@ def _with_another_lens(
         if _is_clearly_better(other, best):
             best = other
     return best
+
+
+def _without_contradicted_exif(
+    model: pycolmap.Reconstruction | None,
+    database: Path,
+    mapped: Callable[..., list[pycolmap.Reconstruction]],
+) -> pycolmap.Reconstruction | None:
+    """The model, or one in which focal lengths from EXIF that it contradicts are as unknown.
+
+    The other must not be clearly worse, and be confirmed: where there is little texture EXIF knows best.
+    """
+    contradicted = set() if model is None else contradicted_lenses(model)
+    if model is None or not contradicted:
+        return model
+    own = _copied(database, "without_exif")
+    _forget_focal_lengths(own, contradicted)
+    other = max(mapped(own), key=_merit, default=None)
+    if other is None or _is_clearly_better(model, other):
+        return model
+    return other if _fewest_confirming(other) >= FEWEST_CONFIRMING else model
+
+
+def _copied(database: Path, folder: str) -> Path:
+    """A copy of the database in a folder of its own beside it."""
+    own = database.parent / folder / database.name
+    own.parent.mkdir(exist_ok=True)
+    shutil.copyfile(database, own)
+    return own
 
 
 def _few_that_share_most(model: pycolmap.Reconstruction) -> list[str]:
@@ -413,8 +443,9 @@ def _few_that_share_most(model: pycolmap.Reconstruction) -> list[str]:
 def _is_clearly_better(model: pycolmap.Reconstruction, than: pycolmap.Reconstruction | None) -> bool:
     if than is None:
         return True
-    placed, confirmed, _ = _merit(than)
-    return _merit(model) > (placed, int(_CLEARLY_MORE * confirmed), 0)
+    (placed, confirmed, _), (placed_than, confirmed_than, _) = _merit(model), _merit(than)
+    # Points of two photographs alone decide nothing: they follow any focal length.
+    return placed > placed_than or (placed == placed_than and confirmed > _CLEARLY_MORE * confirmed_than)
 
 
 def _begin_with(database: Path, factor: float) -> None:
@@ -425,6 +456,36 @@ def _begin_with(database: Path, factor: float) -> None:
                 continue
             lens.focal_length = factor * max(lens.width, lens.height)
             opened.update_camera(lens)
+
+
+def _forget_focal_lengths(database: Path, camera_ids: Set[int]) -> None:
+    """Make the focal lengths of these lenses unknown, as those of photographs without EXIF."""
+    with pycolmap.Database.open(database) as opened:
+        for lens in opened.read_all_cameras():
+            if lens.camera_id in camera_ids:
+                lens.has_prior_focal_length = False
+                lens.focal_length = _UNKNOWN_FOCAL_FACTOR * max(lens.width, lens.height)
+                opened.update_camera(lens)
+
+
+def _groups_against_exif(model: pycolmap.Reconstruction, groups: Sequence[LensGroup]) -> dict[int, LensGroup]:
+    """By lens, the photographs whose focal length from EXIF was taken as unknown."""
+    placed = (model.images[image_id] for image_id in model.reg_image_ids())
+    lens_of = {image.name: model.cameras[image.camera_id] for image in placed}
+    return {
+        lens_of[name].camera_id: group
+        for group in groups
+        for name in group.names
+        if group.focal_px is not None and name in lens_of and not lens_of[name].has_prior_focal_length
+    }
+
+
+def _why_not_exif(group: LensGroup) -> Decision:
+    return Decision(
+        what=f"EXIF of the {group.width}x{group.height} photographs",
+        choice="its focal length is not believed",
+        because=f"without its {group.focal_px:.0f} px the photographs fit each other far better",
+    )
 
 
 def _why_fainter(

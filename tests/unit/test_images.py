@@ -226,6 +226,20 @@ def test_more_pixels_than_any_camera_has_are_refused(
     assert "bomb" not in caught.value.text
 
 
+@pytest.mark.parametrize(
+    "entries",
+    [
+        {ExifTags.Base.FocalLengthIn35mmFilm: 1},
+        {ExifTags.Base.FocalLength: 0.1, ExifTags.Base.FocalPlaneXResolution: 2540.0},
+    ],
+    ids=["equivalent", "density"],
+)
+def test_a_focal_length_shorter_than_any_lens_is_none(entries: dict[int, float]) -> None:
+    assert focal_px_or_none(exif_with(entries), 640, 480) is None
+    longer = {tag: 10 * value for tag, value in entries.items()}
+    assert focal_px_or_none(exif_with(longer), 640, 480) is not None
+
+
 @pytest.mark.parametrize("suffix", ["jpg", "png", "tif", "heic"])
 @pytest.mark.parametrize("share", [0.0, 0.02, 0.6])
 def test_a_file_cut_short_is_refused_by_name(
