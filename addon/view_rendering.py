@@ -19,7 +19,7 @@ from .camera_lens import pinhole_of, world_from_camera
 from .kept_settings import Change, changed
 from .png import critical_chunks
 from .solved import SolvedCamera, write_cameras
-from .true_mesh import TrueMesh, instanced_by, rendered_objects, subject_of, true_mesh, write_ply
+from .true_mesh import TrueMesh, as_rendered, instanced_by, rendered_objects, subject_of, true_mesh, write_ply
 
 IMAGES, TRANSFORMS, TRUTH = "images", "transforms.json", "truth.ply"
 ENGINES = {"CYCLES": "CYCLES", "WORKBENCH": "BLENDER_WORKBENCH"}
@@ -93,8 +93,9 @@ def render_views(request: ViewRequest, folder: Path) -> Generator[tuple[int, Pat
     )
     with _same_frame(scene), changed(changes):
         _go_to(scene, request.views[0])
-        truth = _truth(subject) if subject else None
-        masked = _mask_changes(scene, subject, scene.render.engine)
+        with as_rendered(subject):  # both ask for it: once is enough
+            truth = _truth(subject) if subject else None
+            masked = _mask_changes(scene, subject, scene.render.engine)
         with changed(masked):
             for index, view in enumerate(request.views):
                 _go_to(scene, view)

@@ -21,7 +21,7 @@ import torch
 
 from .errors import ErrorCode, ReconstructionError
 from .machine import choose_device, peak_memory_bytes, set_up_torch
-from .maths.metrics import elsewhere_text, load_truth
+from .maths.metrics import TrueSurface, elsewhere_text, load_truth
 from .mesh_files import SPARSE
 from .presets import Settings
 from .previews import Previews
@@ -255,8 +255,8 @@ def run(job: Job, workspace: Workspace, *, settings: Settings, stages: Stages, l
     results of an earlier run are as they were. A folder about other photographs is such a thing, and one with
     a mesh that would not fit the cameras, where these alone are asked for.
     """
-    if job.truth is not None:
-        load_truth(job.truth)  # better told now than after minutes of work
+    # what is unreadable is better told now than after minutes of work
+    truth = None if job.truth is None else load_truth(job.truth)
     device = choose_device(job.device)
     set_up_torch(device)
     files = _files(job)
@@ -280,7 +280,9 @@ def run(job: Job, workspace: Workspace, *, settings: Settings, stages: Stages, l
     lenses = zip(solved.views, solved.lenses, strict=True)
     originals = tuple(Original(path=files.photos[view.name], lens=lens) for view, lens in lenses)
     placed = (solved, region, device)
-    inputs, radiance = _reconstructed(job, this, settings, stages, placed=placed, originals=originals)
+    inputs, radiance = _reconstructed(
+        job, this, settings, stages, placed=placed, originals=originals, truth=truth
+    )
     report = this.unkept_stage("report", partial(stages.build_report, inputs, settings.report))
     return Outcome(files=write_all(report, radiance, workspace, frame=frame), summary=summary(report))
 
@@ -343,6 +345,7 @@ def _reconstructed(
     *,
     placed: tuple[SolvedCameras, Region, torch.device],
     originals: tuple[Original, ...],
+    truth: TrueSurface | None,
 ) -> tuple[ReportInputs, Radiance | None]:
     """The mesh, with all that the report tells of it, and the field to render from, where there is one."""
     solved, region, device = placed
@@ -362,7 +365,7 @@ def _reconstructed(
     surface = this.stage("train", fit)
     extract = partial(stages.extract_mesh, views, region, stereo, surface, settings.mesh, originals=originals)
     mesh = this.stage("mesh", extract)
-    if job.truth is not None and (text := elsewhere_text(mesh, load_truth(job.truth))):
+    if truth is not None and (text := elsewhere_text(mesh, truth)):
         this.warn(text)
     inputs = ReportInputs(
         job_name=job.output.resolve().name,
