@@ -5,6 +5,7 @@
 """
 
 import sys
+import tempfile
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -20,7 +21,9 @@ def main(words: list[str]) -> int:
     options = ["-o", "addopts=--strict-markers --import-mode=importlib", "-p", "no:cacheprovider"]
     # Blender's own modules leave files open; ours are held to account where Blender is a module.
     options += ["-W", "ignore::pytest.PytestUnraisableExceptionWarning"]
-    return int(pytest.main([*options, "--rootdir", str(ROOT), *chosen]))
+    # Two Blenders tested side by side must not tidy the same folder of old runs: each would find files gone.
+    with tempfile.TemporaryDirectory(prefix="fewview-", ignore_cleanup_errors=True) as folder:
+        return int(pytest.main([*options, "--basetemp", f"{folder}/tests", "--rootdir", str(ROOT), *chosen]))
 
 
 if __name__ == "__main__":
