@@ -1,10 +1,12 @@
 """What to reconstruct: a sphere around the subject, found from masks, sparse points or cameras.
 
 In this order of evidence: masks cut out the subject from every side; without them, triangulated
-points say where the photographs overlap; without those, the cameras' axes say what they look at.
+points say where the photographs overlap; without those, the cameras' axes say what they look at. What
+stands whole before an even backdrop is not cut off.
 """
 
 import math
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -14,6 +16,7 @@ from scipy.ndimage import label
 from ..errors import ErrorCode, ReconstructionError
 from ..maths.projection import in_picture, projected, shown
 from ..scene import Camera, Decision, Progress, Region, SolvedCameras, View, to_unit_sphere
+from .standing_alone import share_cut_off, standing_alone
 
 FEATURES_REACH = 1.1
 """The surface goes on where features end."""
@@ -28,6 +31,8 @@ LEAST_COMMON = 0.6
 right or a twentieth of the picture off; in the worst photograph 0.2 to 0.5 if one of them is inverted."""
 
 
+_CUT_OFF = 0.01
+"""Share of what stands whole before a backdrop that the region may leave out."""
 _FINER = 3
 """Times as many cells along each axis, where those that are enough for most things find masks in conflict."""
 _CLOSE_UP = 0.5
@@ -59,13 +64,8 @@ def find_region(solved: SolvedCameras, config: RegionConfig, *, progress: Progre
         return _region(centre, config.radius_world, "as given", "set by the user")
     masked = [view for view in solved.views if view.mask is not None]
     if len(masked) >= 2:
-        try:
-            centre, radius = _of_masks(masked, config)
-        except ReconstructionError:  # narrow bars may fall between the middles of all cells
-            centre, radius = _of_masks(masked, replace(config, hull_cells=_FINER * config.hull_cells))
-        return _region(
-            centre, radius * config.margin, "the masked subject", f"{len(masked)} photographs have masks"
-        )
+        centre, radius = _of_masks(masked, config)
+        return _region(centre, radius, "the masked subject", f"{len(masked)} photographs have masks")
     cameras = _overviews([view.camera for view in solved.views])
     if len(solved.sparse_positions) >= 20:
         centre, radius = _of_points(solved, cameras)
@@ -75,11 +75,31 @@ def find_region(solved: SolvedCameras, config: RegionConfig, *, progress: Progre
             because = f"{share:.0%} of the triangulated points lie there, the others up to "
             because += f"{radius / within:.0f} times as far from each other"
             return _region(middle, within, "what all photographs have in their middle", because)
-        because = f"no masks, but {len(solved.sparse_positions)} triangulated points"
         radius *= FEATURES_REACH * config.margin
-        return _region(centre, radius, "where the photographs overlap", because)
-    centre, radius = _of_cameras(cameras)
-    return _region(centre, radius, "what all cameras look at", "neither masks nor triangulated points")
+        choice = "where the photographs overlap"
+        because = f"no masks, but {len(solved.sparse_positions)} triangulated points"
+    else:
+        centre, radius = _of_cameras(cameras)
+        choice, because = "what all cameras look at", "neither masks nor triangulated points"
+    alone = standing_alone(solved.views)
+    if len(alone) >= 2 and (cut_off := share_cut_off(alone, centre, radius)) > _CUT_OFF:
+        with suppress(ReconstructionError):  # what each shows may be another thing
+            centre, radius = around_both((centre, radius), _of_masks(alone, config))
+            choice += ", and what stands alone before an even backdrop"
+            because += f", which leave out {cut_off:.0%} of what {len(alone)} photographs show whole"
+    return _region(centre, radius, choice, because)
+
+
+def around_both(
+    one: tuple[Float64[np.ndarray, "3"], float], other: tuple[Float64[np.ndarray, "3"], float]
+) -> tuple[Float64[np.ndarray, "3"], float]:
+    """Centre and radius of the smallest sphere around two."""
+    (small, small_radius), (large, large_radius) = sorted((one, other), key=lambda sphere: sphere[1])
+    apart = float(np.linalg.norm(large - small))
+    if apart + small_radius <= large_radius:
+        return large, large_radius
+    radius = (apart + small_radius + large_radius) / 2
+    return small + (large - small) * (radius - small_radius) / apart, radius
 
 
 def _region(centre: Float64[np.ndarray, "3"], radius: float, choice: str, because: str) -> Region:
@@ -199,6 +219,15 @@ def weighted_quantile(
 
 
 def _of_masks(views: list[View], config: RegionConfig) -> tuple[Float64[np.ndarray, "3"], float]:
+    """Bounding sphere of the visual hull, with room around it."""
+    try:
+        centre, radius = _of_hull(views, config)
+    except ReconstructionError:  # narrow bars may fall between the middles of all cells
+        centre, radius = _of_hull(views, replace(config, hull_cells=_FINER * config.hull_cells))
+    return centre, radius * config.margin
+
+
+def _of_hull(views: list[View], config: RegionConfig) -> tuple[Float64[np.ndarray, "3"], float]:
     """Bounding sphere of the visual hull: what lies inside the masks of all photographs that show it.
 
     Photographs from nearly one side leave the hull open in depth; there the subject is taken to be

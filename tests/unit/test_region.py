@@ -14,7 +14,7 @@ from backend.errors import ErrorCode, ReconstructionError
 from backend.maths.projection import projected
 from backend.maths.raycast import RayCaster, camera_rays
 from backend.scene import Camera, Region, SolvedCameras, no_progress, transform_points
-from backend.stages.region import RegionConfig, find_region, nearest_to_axes, weighted_quantile
+from backend.stages.region import RegionConfig, around_both, find_region, nearest_to_axes, weighted_quantile
 from tests.synthetic_scene import (
     CENTRE,
     DISTANCE,
@@ -48,9 +48,9 @@ def surface_samples(count: int, seed: int = 0) -> np.ndarray:
 
 
 def without_images(cameras: list[Camera], **changes: object) -> SolvedCameras:
-    """Solved views of cameras whose pictures do not matter."""
+    """Solved views of cameras whose pictures do not matter: nothing in them stands alone."""
     small = [replace(camera.resized(24, 18)) for camera in cameras]
-    scene: Scene = photographed(small)
+    scene: Scene = photographed(small, wall=True)
     return replace(scene.without_masks().solved(), **changes)  # type: ignore[arg-type]
 
 
@@ -252,6 +252,76 @@ def test_a_room_with_few_points_in_the_middle_is_taken_whole() -> None:
 
 def sparse(points: np.ndarray) -> dict[str, np.ndarray]:
     return {"sparse_positions": points, "sparse_visibility": np.ones((len(points), 3), bool)}
+
+
+# before an even backdrop
+
+
+def in_the_middle(count: int = 200) -> np.ndarray:
+    """Samples of the surface between its two lobes, where alone there may be texture."""
+    points = surface_samples(20 * count)
+    return points[np.abs(points - CENTRE)[:, 0] < 0.4 * REACH][:count]
+
+
+def test_what_stands_alone_before_a_backdrop_is_not_cut_off_where_it_has_no_texture() -> None:
+    scene = photographed(arc_cameras(3, 40, 160))
+    bare = scene.without_masks().solved()
+    cut = region_of(without_images(scene.cameras, **sparse(in_the_middle())))
+    assert share_inside(cut) < 0.9
+    for points in (in_the_middle(), surface_samples(0)):
+        region = region_of(replace(bare, **sparse(points)))  # type: ignore[arg-type]
+        assert share_inside(region) > 0.99
+        assert region.radius_world < 1.1 * region_of(scene.solved()).radius_world
+        assert "stands alone before an even backdrop" in region.decisions[0].choice
+
+
+def test_a_region_that_leaves_nothing_out_stays() -> None:
+    scene = photographed(arc_cameras(3, 40, 160))
+    points = surface_samples(400)
+    before_black = region_of(replace(scene.without_masks().solved(), **sparse(points)))  # type: ignore[arg-type]
+    before_wall = region_of(without_images(scene.cameras, **sparse(points)))
+    np.testing.assert_array_equal(before_black.object_from_world, before_wall.object_from_world)
+
+
+def test_what_the_border_cuts_does_not_stand_alone() -> None:
+    scene = photographed(arc_cameras(3, 40, 160)).without_masks()
+    tables = [view.image_srgb.copy() for view in scene.views]
+    for table in tables:
+        table[80:, 60:100] = 0.7
+    views = tuple(replace(v, image_srgb=image) for v, image in zip(scene.views, tables, strict=True))
+    points = in_the_middle()
+    region = region_of(replace(scene.solved(), views=views, **sparse(points)))  # type: ignore[arg-type]
+    of_points = region_of(without_images(scene.cameras, **sparse(points)))
+    np.testing.assert_array_equal(region.object_from_world, of_points.object_from_world)
+
+
+def test_things_that_are_not_one_leave_the_region_to_the_points() -> None:
+    """Each photograph shows another patch alone before black: they have no part of space in common."""
+    scene = photographed(arc_cameras(3, 40, 160)).without_masks()
+    pictures = [np.zeros_like(view.image_srgb) for view in scene.views]
+    for index, picture in enumerate(pictures):
+        picture[20 + 30 * index : 40 + 30 * index, 20 + 40 * index : 50 + 40 * index] = 0.8
+    views = tuple(replace(v, image_srgb=image) for v, image in zip(scene.views, pictures, strict=True))
+    points = in_the_middle()
+    region = region_of(replace(scene.solved(), views=views, **sparse(points)))  # type: ignore[arg-type]
+    of_points = region_of(without_images(scene.cameras, **sparse(points)))
+    np.testing.assert_array_equal(region.object_from_world, of_points.object_from_world)
+
+
+@pytest.mark.parametrize(
+    ("apart", "radii", "expected_x", "expected_radius"),
+    [(3.0, (1.0, 2.0), 2.0, 3.0), (0.5, (2.0, 1.0), 0.0, 2.0), (0.0, (1.0, 1.0), 0.0, 1.0)],
+)
+def test_the_sphere_around_two_touches_both_or_is_one_of_them(
+    apart: float, radii: tuple[float, float], expected_x: float, expected_radius: float
+) -> None:
+    """From -1 to 5 along x, for the first."""
+    along_x = np.array([1.0, 0.0, 0.0])
+    other = CENTRE + apart * along_x
+    for spheres in (((CENTRE, radii[0]), (other, radii[1])), ((other, radii[1]), (CENTRE, radii[0]))):
+        centre, radius = around_both(*spheres)
+        np.testing.assert_allclose(centre, CENTRE + expected_x * along_x, atol=1e-12)
+        assert radius == pytest.approx(expected_radius)
 
 
 # from cameras alone
