@@ -24,6 +24,7 @@ from ..maths.inverse_depth import fit_planes, normals_from_planes
 from ..maths.texture import leverage
 from ..scene import DepthMap, Progress, Region, StereoResult, SurfacePoints, View, within
 from .depth_maps import Measured, depth_maps
+from .gaps import without_covered_patches
 from .outlines_alone import FEWEST_POINTS, check_enough, no_points, outlines_alone
 from .stereo_config import StereoConfig
 from .stereo_windows import neighbours, pyramid, sees_region
@@ -46,8 +47,9 @@ def match_views(
         sizes = depth_maps(pyramids, nearby, config, within(progress, 0.0, 0.95))
         points = _points(views, sizes, config)
     check_enough(points, views)
-    full_size = (_full_size(view, maps, region, config) for view, maps in zip(views, sizes, strict=True))
-    found = StereoResult(points=points, depth_maps=tuple(full_size))
+    full_size = tuple(_full_size(view, maps, region, config) for view, maps in zip(views, sizes, strict=True))
+    full_size = without_covered_patches(full_size, points, views, region)
+    found = StereoResult(points=points, depth_maps=full_size)
     if len(points.positions) < FEWEST_POINTS:
         return outlines_alone(found)
     return replace(found, points=without_strays(points))
