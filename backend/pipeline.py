@@ -365,8 +365,9 @@ def _reconstructed(
     surface = this.stage("train", fit)
     extract = partial(stages.extract_mesh, views, region, stereo, surface, settings.mesh, originals=originals)
     mesh = this.stage("mesh", extract)
-    if truth is not None and (text := elsewhere_text(mesh, truth)):
-        this.warn(text)
+    elsewhere = "" if truth is None else elsewhere_text(mesh, truth)
+    if elsewhere:
+        this.warn(elsewhere)
     inputs = ReportInputs(
         job_name=job.output.resolve().name,
         settings=settings,
@@ -378,7 +379,8 @@ def _reconstructed(
         region=region,
         points=stereo.points,
         mesh=mesh,
-        truth=job.truth,
+        truth=truth,
+        truth_elsewhere=bool(elsewhere),
         versions=versions(),
     )
     return inputs, surface.radiance
