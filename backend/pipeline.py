@@ -257,7 +257,8 @@ def run(job: Job, workspace: Workspace, *, settings: Settings, stages: Stages, l
     """
     # what is unreadable is better told now than after minutes of work
     truth = None if job.truth is None else load_truth(job.truth)
-    device = choose_device(job.device)
+    full_gpu: list[str] = []
+    device = choose_device(job.device, full_gpu.append)
     set_up_torch(device)
     files = _files(job)
     fingerprints = stage_fingerprints(job, files, settings, device.type)
@@ -272,6 +273,8 @@ def run(job: Job, workspace: Workspace, *, settings: Settings, stages: Stages, l
     to_come = set(names) - set(finished)
     check_free_space(workspace.folder, _needed_bytes(len(files.photos), to_come, settings))
     this = _Run(workspace=workspace, listener=listener, fingerprints=fingerprints, stage_names=names)
+    for text in full_gpu:
+        this.warn(text)
     solved, region = _placed(job, files, this, settings, stages)
     if job.until == "cameras":
         name = job.output.resolve().name
