@@ -67,6 +67,12 @@ check: .venv/.ready
 	@# The add-on is a package inside the extension, whose name is that of a folder: here a link to this one.
 	mkdir -p build/types && ln -sfn ../.. build/types/fewview
 	MYPYPATH=build/types $(BACKEND) -m mypy --package fewview.addon
+	@# And as on other systems, with a cache for each: in one for all each would be read anew every time.
+	for platform in win32 darwin; do \
+	    $(BACKEND) -m mypy --platform $$platform --cache-dir .mypy_cache/$$platform || exit 1; \
+	    MYPYPATH=build/types $(BACKEND) -m mypy --platform $$platform --cache-dir .mypy_cache/$$platform \
+	        --package fewview.addon || exit 1; \
+	done
 
 BENCHMARK := build/benchmark
 SUITE ?= quick

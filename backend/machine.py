@@ -1,9 +1,10 @@
 """What this computer offers: devices, cores, memory; and torch set up for them."""
 
+import logging
 import os
 import re
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,6 +14,10 @@ from .errors import ErrorCode, ReconstructionError
 from .failures import first_line
 
 _ARCHITECTURE = re.compile(r"(sm|compute)_(\d+)(\d)([af]?)$")
+_FEWEST_FREE_GB = 1.5
+"""Of the GPU's memory. Six photographs take 0.45 beside what CUDA itself takes, twenty large ones more."""
+
+logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -68,15 +73,25 @@ def _runs(architecture: re.Match[str], capability: tuple[int, int]) -> bool:
     return capability >= version and (capability[0] == version[0] or (form, only) == ("compute", ""))
 
 
-def choose_device(kind: str) -> torch.device:
+def choose_device(kind: str, warn: Callable[[str], object] = logger.warning) -> torch.device:
     """The device of the kind; ReconstructionError where it is not there.
 
-    For "auto" CUDA where it is, else the CPU. Apple's GPU is for those who ask for it: nothing has been run
-    on it yet, while the CPU's compiled steps are measured.
+    For "auto" CUDA where it is and others have left it memory, which is told by `warn` if not, else the CPU.
+    Apple's GPU is for those who ask for it: nothing has been run on it yet, while the CPU's compiled steps
+    are measured.
     """
     available = available_devices()
     if kind == "auto":
-        return torch.device("cuda" if "cuda" in available else "cpu")
+        if "cuda" not in available:
+            return torch.device("cpu")
+        free_gb = _free_gpu_bytes() / 1e9
+        if free_gb < _FEWEST_FREE_GB:
+            warn(
+                f"The CPU is used: of the GPU's memory only {free_gb:.1f} GB are free, and a job may need "
+                f"{_FEWEST_FREE_GB} GB. Close what else uses the GPU, or choose the device cuda all the same."
+            )
+            return torch.device("cpu")
+        return torch.device("cuda")
     if kind not in available:
         faults = [f"{seen.name}: {seen.fault}" for seen in seen_devices() if seen.kind == kind and seen.fault]
         why = faults[0] if faults else f"there is {', '.join(available)}"
@@ -86,6 +101,14 @@ def choose_device(kind: str) -> torch.device:
             "Choose the device automatically (auto), or install a torch that supports your GPU.",
         )
     return torch.device(kind)
+
+
+def _free_gpu_bytes() -> int:
+    try:
+        free, _ = torch.cuda.mem_get_info()
+    except RuntimeError:  # there is not even room for CUDA itself
+        return 0
+    return free
 
 
 def set_up_torch(device: torch.device) -> None:

@@ -6,13 +6,11 @@ device and the code. The same fingerprint means that the result can be taken fro
 """
 
 import logging
-import platform
 import time
 import typing
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from functools import cache, partial
-from importlib.metadata import version
+from functools import partial
 from itertools import takewhile
 from pathlib import Path
 from types import MappingProxyType
@@ -25,6 +23,7 @@ from .maths.metrics import TrueSurface, elsewhere_text, load_truth
 from .mesh_files import SPARSE
 from .presets import Settings
 from .previews import Previews
+from .provenance import code_fingerprint, versions
 from .results import cameras_summary, check_no_mesh_of_others, summary, write_all, write_cameras
 from .scene import Decision, Photo, Region, SolvedCameras, StereoResult, SurfaceMesh, View
 from .stages.camera_refinement import match_solved, with_refined
@@ -50,7 +49,6 @@ from .stages.region import find_region
 from .stages.report import Report, ReportInputs, StageTiming, build_report
 from .stages.surface import Surface
 from .stages.train import TrainConfig, fit_surface
-from .version import VERSION
 from .wire.photographs import passed_over, passed_over_text
 from .workspace import StageCost, Workspace, check_free_space, content_of, fingerprint
 
@@ -66,32 +64,6 @@ points. Measured: 12 to 16, 14 to 18, 8 to 23."""
 _SHORT_BY_LONG_SIDE = 0.75
 """Of most photographs; the others are a little narrower."""
 _BYTES_FOR_RESULTS = 400_000_000
-_COMPUTING_FOLDERS = ("kernels", "maths", "stages")
-_COMPUTING_MODULES = (
-    "errors.py",
-    "images.py",
-    "machine.py",
-    "mesh_files.py",
-    "pipeline.py",
-    "point_methods.py",
-    "scene.py",
-    "wire/photographs.py",
-)
-_PACKAGES = (
-    "torch",
-    "numba",
-    "pycolmap",
-    "numpy",
-    "scipy",
-    "scikit-image",
-    "trimesh",
-    "embreex",
-    "fast-simplification",
-    "pillow",
-    "pillow-heif",
-)
-"""All that compute, or read photographs."""
-
 logger = logging.getLogger(__name__)
 
 
@@ -257,7 +229,8 @@ def run(job: Job, workspace: Workspace, *, settings: Settings, stages: Stages, l
     """
     # what is unreadable is better told now than after minutes of work
     truth = None if job.truth is None else load_truth(job.truth)
-    device = choose_device(job.device)
+    full_gpu: list[str] = []
+    device = choose_device(job.device, full_gpu.append)
     set_up_torch(device)
     files = _files(job)
     fingerprints = stage_fingerprints(job, files, settings, device.type)
@@ -272,6 +245,8 @@ def run(job: Job, workspace: Workspace, *, settings: Settings, stages: Stages, l
     to_come = set(names) - set(finished)
     check_free_space(workspace.folder, _needed_bytes(len(files.photos), to_come, settings))
     this = _Run(workspace=workspace, listener=listener, fingerprints=fingerprints, stage_names=names)
+    for text in full_gpu:
+        this.warn(text)
     solved, region = _placed(job, files, this, settings, stages)
     if job.until == "cameras":
         name = job.output.resolve().name
@@ -365,8 +340,9 @@ def _reconstructed(
     surface = this.stage("train", fit)
     extract = partial(stages.extract_mesh, views, region, stereo, surface, settings.mesh, originals=originals)
     mesh = this.stage("mesh", extract)
-    if truth is not None and (text := elsewhere_text(mesh, truth)):
-        this.warn(text)
+    elsewhere = "" if truth is None else elsewhere_text(mesh, truth)
+    if elsewhere:
+        this.warn(elsewhere)
     inputs = ReportInputs(
         job_name=job.output.resolve().name,
         settings=settings,
@@ -378,7 +354,8 @@ def _reconstructed(
         region=region,
         points=stereo.points,
         mesh=mesh,
-        truth=job.truth,
+        truth=truth,
+        truth_elsewhere=bool(elsewhere),
         versions=versions(),
     )
     return inputs, surface.radiance
@@ -405,22 +382,6 @@ def stage_fingerprints(job: Job, files: _Files, settings: Settings, device_kind:
     for name in CHECKPOINTED:
         before = found[name] = fingerprint(before, *own[name])
     return found
-
-
-@cache
-def code_fingerprint() -> str:
-    """Changes with the code that computes results, so that no result of older code is taken for new.
-
-    Packages belong to it: another version of one may round otherwise, or decide otherwise.
-    """
-    return fingerprint(sorted(versions().items()), *computing_sources())
-
-
-def computing_sources() -> tuple[Path, ...]:
-    """The files whose code decides what a kept stage gives."""
-    here = Path(__file__).parent
-    folders = (path for name in _COMPUTING_FOLDERS for path in (here / name).rglob("*.py"))
-    return tuple(sorted([*(here / name for name in _COMPUTING_MODULES), *folders]))
 
 
 def _finished(workspace: Workspace, fingerprints: dict[str, str], names: tuple[str, ...]) -> tuple[str, ...]:
@@ -452,8 +413,3 @@ def _decisions(*results: typing.Any) -> tuple[Decision, ...]:
     """The decisions of all stages, in their order, each once."""
     found = (decision for result in results for decision in getattr(result, "decisions", ()))
     return tuple(dict.fromkeys(found))
-
-
-def versions() -> dict[str, str]:
-    """What the result depends on, with versions."""
-    return {"FewView": VERSION, "Python": platform.python_version(), **{n: version(n) for n in _PACKAGES}}

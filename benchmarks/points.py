@@ -38,8 +38,8 @@ from backend.machine import choose_device, set_up_torch
 from backend.maths.metrics import TrueSurface, load_truth, surface_error
 from backend.maths.nearest import nearest_tree
 from backend.maths.neighbours import neighbour_planes
-from backend.pipeline import versions
 from backend.point_methods import PointMethod
+from backend.provenance import versions
 from backend.scene import SurfaceMesh, no_progress
 from backend.stages import point_network
 from backend.stages.mesh import MeshConfig, vertex_normals

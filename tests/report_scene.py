@@ -1,11 +1,11 @@
 """A made-up finished run: a patterned ball on a foot, "photographed" by drawing a finer, true one."""
 
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 import trimesh
 
+from backend.maths.metrics import TrueSurface
 from backend.maths.raycast import render_mesh
 from backend.scene import (
     Camera,
@@ -138,12 +138,12 @@ def finished_run(
         ),
         mesh=mesh,
         truth=None,
+        truth_elsewhere=False,
         versions={"FewView": "0.1.0", "torch": "2.13.0", "pycolmap": "4.2.1", "Python": "3.11"},
     )
 
 
-def with_truth(inputs: ReportInputs, path: Path, *, resolution: int = 4) -> ReportInputs:
-    """The same run, with the true mesh written to a file."""
+def with_truth(inputs: ReportInputs, *, resolution: int = 4) -> ReportInputs:
+    """The same run, with the true mesh."""
     truth = figure_mesh(resolution)
-    trimesh.Trimesh(truth.vertices, truth.faces, process=False).export(path)
-    return replace(inputs, truth=path)
+    return replace(inputs, truth=TrueSurface(vertices=truth.vertices, faces=truth.faces))

@@ -9,8 +9,8 @@ from typing import Any, Generic, TypeVar
 from ..errors import ReconstructionError
 from ..machine import choose_device, peak_memory_bytes, set_up_torch
 from ..maths.metrics import load_truth, surface_error
-from ..pipeline import versions
 from ..presets import Settings
+from ..provenance import versions
 from ..scene import StereoResult, SurfaceMesh, View
 from ..stages.report import error_numbers
 from ..stages.surface import Surface

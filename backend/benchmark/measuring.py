@@ -18,8 +18,8 @@ from ..errors import ReconstructionError
 from ..machine import choose_device
 from ..maths.metrics import load_truth
 from ..mesh_files import read_mesh
-from ..pipeline import code_fingerprint
 from ..presets import PRESETS
+from ..provenance import code_fingerprint
 from ..records import load_record
 from ..results import RADIANCE
 from ..stages.radiance_field import Radiance

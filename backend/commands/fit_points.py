@@ -83,7 +83,7 @@ def _fit_into(
     from ..stages.point_fit import PointFitConfig, fit_points
     from ..stages.point_mesh import mesh_of_points
 
-    device = choose_device(parsed.device)
+    device = choose_device(parsed.device, listener.warned)
     set_up_torch(device)
     began_s = time.perf_counter()
     stages = _Stages(listener)

@@ -98,7 +98,7 @@ def depth_maps(
         sharp = [
             _improved(map_, near, [0.25, 0.125], config) for map_, near in zip(maps, sources, strict=True)
         ]
-        votes = [_votes(index, sharp, nearby, config) for index in range(len(sharp))]
+        votes = _votes(sharp, nearby, config)
         by_size.insert(0, [_measured(*one, config) for one in zip(sharp, votes, sources, strict=True)])
     return [_each_once(list(sizes), config) for sizes in zip(*by_size, strict=True)]
 
@@ -147,7 +147,7 @@ def _swept_again(
 ) -> list[Map]:
     """All depths tried again where views agree on nothing."""
     subjects = [subject_of(map_.window) for map_ in maps]
-    measured = [_votes(index, maps, nearby, config) > 0 for index in range(len(maps))]
+    measured = [votes > 0 for votes in _votes(maps, nearby, config)]
     again = []
     for index, near in enumerate(sources):
         progress(index / len(maps), f"depth of photograph {index + 1}")
@@ -161,7 +161,7 @@ def _told_by_others(
     maps: list[Map], sources: list[list[Window]], nearby: list[list[int]], config: StereoConfig
 ) -> list[Map]:
     """What other views found tried where views agree on nothing."""
-    measured = [_votes(index, maps, nearby, config) > 0 for index in range(len(maps))]
+    measured = [votes > 0 for votes in _votes(maps, nearby, config)]
     places = [unconfirmed(map_, known, config) for map_, known in zip(maps, measured, strict=True)]
     told = [
         with_depths_of(maps[index], measured[index], [places[k] for k in near], views, config)
@@ -180,7 +180,7 @@ def _grown_together(
 ) -> list[Map]:
     """Rounds of growth over all views."""
     for round_ in range(rounds):
-        votes = [_votes(index, maps, nearby, config) for index in range(len(maps))]
+        votes = _votes(maps, nearby, config)
         for index, near in enumerate(sources):
             progress((round_ + index / len(maps)) / rounds, f"depth of photograph {index + 1}")
             if near:
@@ -316,6 +316,13 @@ def _measured(
 
 
 def _votes(
+    maps: list[Map], nearby: list[list[int]], config: StereoConfig
+) -> list[Float[Tensor, "height width"]]:
+    """For each map how many views agree with its depths."""
+    return [_votes_of(index, maps, nearby, config) for index in range(len(maps))]
+
+
+def _votes_of(
     index: int, maps: list[Map], nearby: list[list[int]], config: StereoConfig
 ) -> Float[Tensor, "height width"]:
     """How many views agree with each pixel's depth (itself counted), 0 where it is not a measurement.

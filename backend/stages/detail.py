@@ -11,7 +11,7 @@ from collections.abc import Callable
 from statistics import median
 
 import torch
-from jaxtyping import Float, Int64
+from jaxtyping import Float
 from torch import Tensor
 
 from ..maths.evidence import PointDistances, cell_px, scatter_between
@@ -38,7 +38,6 @@ _STEPS = 30
 
 def add_detail(
     scene: Measurements,
-    views: Int64[Tensor, "points"],
     distance: Float[Tensor, "coarse coarse coarse"],
     most: int,
     config: LinearConfig,
@@ -46,14 +45,14 @@ def add_detail(
 ) -> tuple[Float[Tensor, "nodes nodes nodes"], Decision]:
     """The field on up to `most` nodes along each axis, with detail if there is such, or as it was; and why.
 
-    `views` are those whose depth maps the points come from. `there_is_time` for so many nodes.
+    `there_is_time` for so many nodes.
     """
     coarse, config = len(distance), for_textured(config)
     if most < _WORTH_IT * coarse:
         return distance, Decision(what="detail", choice="left out", because="the preset")
     px = median(cell_px(camera, coarse) for camera in scene.cameras)
     weights = stereo_weights(scene, config)
-    scatter = scatter_between(scene.positions, scene.normals, weights, views, spacing(coarse) / 2)
+    scatter = scatter_between(scene.positions, scene.normals, weights, scene.view_index, spacing(coarse) / 2)
     cells = scatter / spacing(coarse)
     nodes = min(most, int(coarse * min(px / _LEAST_PX, _MOST_SCATTER / max(cells, torch.finfo().tiny))))
     because = f"a cell of the grid is {px:.1f} pixels wide, and " + (

@@ -108,6 +108,7 @@ class FlatFaces(Rows):
             normals=torch.cat([scene.normals, self.normals]),
             colours=torch.cat([scene.colours, self.colours]),
             confidence=torch.cat([scene.confidence, said]),
+            view_index=torch.cat([scene.view_index, self.views]),
         )
 
 

@@ -59,7 +59,7 @@ def may_be_unturned(given: Path) -> bool:
     Those that others wrote as transforms.json: they may have looked at the EXIF orientation or not.
     """
     source = _find_source(given)
-    return source.is_file() and not is_ours(source)
+    return source.is_file() and not is_ours(read_frames(source))
 
 
 def _blanks_of_transforms(path: Path) -> tuple[Photo, ...]:
@@ -158,7 +158,7 @@ def _find_source(given: Path) -> Path:
 
 def _from_transforms(photos: Sequence[Photo], path: Path) -> Placement:
     frames = read_frames(path)
-    estimate = estimate_or_none(path)
+    estimate = estimate_or_none(frames)
     why = _why_unplaced(photos, estimate)
     matched = _matched(photos, [str(frame["file_path"]) for frame in frames], path, left_out=why)
     read = []

@@ -166,14 +166,11 @@ def fit_level(
         )
         met_along = inside_along(through_subject, distance, met_along)
         pulled = _FADE * pulled + _pulls(through_subject.chosen(met_along.isinf()), bound)
-        rays_near, depths = pulled.reshape(*distance.shape, 2).unbind(-1)
-        pull = config.silhouettes * rays_near.clamp(max=1.0) * ~free
-        inside = depths / rays_near.clamp(min=1e-6)
+        pull = _pull(pulled, free, config.silhouettes)
         rims = _rim_distances(scene, rays, distance, nearest, config.rims)
-        rim_weight = rims.weight.clamp(max=2.0)
-        total = weight + measured.weight + pull + rim_weight
+        total = weight + measured.weight + pull.weight + rims.weight
         target = weight * target + measured.weight * measured.distance
-        target += rim_weight * rims.distance - pull * inside
+        target += rims.weight * rims.distance + pull.weight * pull.distance
         last = distance
         distance = ball + fit_smooth(
             target / total - ball, total, last - ball, smoothness=config.smoothness, steps=30
@@ -257,6 +254,15 @@ def _pulls(missed: SilhouetteRays, bound: Float[Tensor, "nodes nodes nodes"]) ->
     return splat(torch.stack([torch.ones_like(depth), depth], dim=-1), locate(middle, nodes), nodes)
 
 
+def _pull(
+    pulled: Float[Tensor, "cells 2"], free: Bool[Tensor, "nodes nodes nodes"], most: float
+) -> PointDistances:
+    """What the pulls, added up, say of the nodes that are not free: to be inside, weighing at `most` that."""
+    rays_near, depths = pulled.reshape(*free.shape, 2).unbind(-1)
+    weight = most * rays_near.clamp(max=1.0) * ~free
+    return PointDistances(distance=-depths / rays_near.clamp(min=1e-6), weight=weight)
+
+
 def _rim_distances(
     scene: Measurements,
     rays: RimRays,
@@ -275,7 +281,8 @@ def _rim_distances(
         nearest, _ = measured.query(positions.cpu().numpy(), workers=-1)
         apart = torch.tensor(nearest, dtype=positions.dtype, device=positions.device)
     doubt = (1 - depth_is_bounded(scene)) * (1 + (apart / _RIM_REACH).square())
-    return point_distances(positions, normals, weight * torch.exp(-doubt), distance.shape[0])
+    said = point_distances(positions, normals, weight * torch.exp(-doubt), distance.shape[0])
+    return replace(said, weight=said.weight.clamp(max=2.0))
 
 
 def _seen_through_any(scene: Measurements, nodes: int, margin: float) -> Bool[Tensor, "nodes nodes nodes"]:

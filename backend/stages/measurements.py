@@ -39,6 +39,8 @@ class Measurements:
     normals: Float[Tensor, "points 3"]
     colours: Float[Tensor, "points 3"]
     confidence: Float[Tensor, "points"]
+    view_index: Int64[Tensor, "points"]
+    """Which view measured each point."""
     region_centre: Float[Tensor, "3"]
     region_radius: float
 
@@ -75,6 +77,7 @@ def measurements(
         normals=_towards_their_views(normals, positions, cameras, view_index),
         colours=torch.tensor(points.colours_srgb, device=device),
         confidence=torch.tensor(points.confidence, device=device),
+        view_index=view_index,
         region_centre=torch.zeros(3, device=device),
         region_radius=1.0,
     )

@@ -9,7 +9,7 @@ take them for something else.
 
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -45,9 +45,9 @@ class Estimate:
     """By the name of each photograph that could not be placed."""
 
 
-def estimate_or_none(path: Path) -> Estimate | None:
+def estimate_or_none(frames: Sequence[Frame]) -> Estimate | None:
     """What `transforms_json` left in the file; None where the cameras come from elsewhere, or were given."""
-    ours = json.loads(path.read_text(encoding="utf-8-sig")).get("fewview")
+    ours = frames[0].get("fewview") if frames else None
     if not isinstance(ours, dict) or ours.get("estimated") is not True:
         return None
     error_px, unplaced = ours.get("reprojection_error_px"), ours.get("unplaced")
@@ -58,9 +58,9 @@ def estimate_or_none(path: Path) -> Estimate | None:
     )
 
 
-def is_ours(path: Path) -> bool:
-    """Whether the file is one that `transforms_json` made. Raises ReconstructionError(CAMERAS_UNUSABLE)."""
-    return any("fewview" in frame for frame in read_frames(path))
+def is_ours(frames: Sequence[Frame]) -> bool:
+    """Whether they are of a file that `transforms_json` made."""
+    return any("fewview" in frame for frame in frames)
 
 
 def read_frames(path: Path) -> list[Frame]:

@@ -9,7 +9,6 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
@@ -22,8 +21,7 @@ from ..kernels.side_by_side import side_by_side
 from ..maths.metrics import (
     ErrorAgainstTruth,
     SurfaceError,
-    elsewhere_text,
-    load_truth,
+    TrueSurface,
     psnr,
     surface_error,
     vertex_error_percent,
@@ -103,7 +101,9 @@ class ReportInputs:
     region: Region
     points: SurfacePoints
     mesh: SurfaceMesh
-    truth: Path | None
+    truth: TrueSurface | None
+    truth_elsewhere: bool
+    """Whether it has another scale or place than the mesh."""
     versions: dict[str, str]
     """Program to version."""
 
@@ -169,12 +169,8 @@ class Report:
 
 
 def build_report(inputs: ReportInputs, config: ReportConfig, *, progress: Progress) -> Report:
-    """Measure the mesh against the photographs, and against the truth where there is one; draw it.
-
-    Raises ReconstructionError(TRUTH_UNREADABLE).
-    """
-    truth = load_truth(inputs.truth) if inputs.truth is not None else None
-    mesh, views = inputs.mesh, inputs.solved.views
+    """Measure the mesh against the photographs, and against the truth where there is one; draw it."""
+    mesh, views, truth = inputs.mesh, inputs.solved.views, inputs.truth
     caster = RayCaster(mesh.vertices, mesh.faces)
     given = [view.camera for view in views]
     shown = {views[index].name for index in _evenly(len(views), config.num_photos_shown)}
@@ -189,8 +185,8 @@ def build_report(inputs: ReportInputs, config: ReportConfig, *, progress: Progre
     if truth is not None:
         progress(0.6, "measuring against the truth")
         # all points of a surface far off are about equally near: each search takes a look at all of them
-        seed, is_near = inputs.seed, not elsewhere_text(mesh, truth)
-        num_samples = config.error_samples if is_near else min(_FEW_SAMPLES, config.error_samples)
+        most = _FEW_SAMPLES if inputs.truth_elsewhere else config.error_samples
+        seed, num_samples = inputs.seed, min(most, config.error_samples)
         error = surface_error(mesh, truth, cameras=given, seed=seed, num_samples=num_samples)
         # The error takes the place of the support, which is drawn in colours from 0 to 1.
         distance = vertex_error_percent(mesh, truth, seed=seed, num_samples=num_samples)

@@ -11,6 +11,8 @@ from dataclasses import dataclass, field
 from functools import partial
 
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from ..maths.grid import refined, spacing
 from ..scene import Decision, Progress, Region, StereoResult, View, within
@@ -25,6 +27,9 @@ from .render_fit import RenderConfig, refine
 from .safe_steps import not_finite
 from .surface import COARSEST, ShowSurface, Surface, show_nothing, tight_frame
 from .unseen_depth import depth_behind
+
+_STEPS_OF_GRID = 10
+"""Of rendering, that fitting points on a grid counts as long as: so progress is told."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -70,77 +75,29 @@ def fit_surface(
     progress(0.0, "finding the extent of the surface")
     with torch.no_grad():
         extent = _extent(measurements(views, region, stereo, device), views, region, config, clock)
-        scene = extent.scene
-        distance = start(scene, extent.radius, config.levels[0])
-    costs = [extent.cost]
-    total = sum(config.steps) + 10 * (len(config.levels) + 1)  # detail is one more
-    done, rendered, taken_back, last = 0, 0, 0, len(config.levels) - 1
-    told: list[FarSide] = []
-    looks = Looks(scene=scene, linear=config.linear, deadline=deadline)
-    for level, (wanted, rounds, steps) in enumerate(
-        zip(config.levels, config.rounds, config.steps, strict=True)
-    ):
-        nodes = finest_grid(costs, len(distance), wanted, deadline.left_s())
-        if nodes == len(distance) < wanted:
-            break
-        progress(done / total, f"fitting points on a grid of {nodes}^3")
-        began_s = clock()
-        with torch.no_grad():
-            # bridges are seen in the first grid's field; finer ones than the second go on without them
-            is_second = config.linear.inner_outlines and len(costs) == 2
-            far = far_sides(scene, distance) if is_second else []
-            told += far
-            before = refined(distance, nodes)
-            spent_s = looks.seconds
-            linear, num_looks = looks.planned(before, _looks_wanted(config, level), is_last=level == last)
-            ask = looks.on_grid(num_looks, within(progress, done / total, (done + 10) / total))
-            distance = fit_level(
-                scene,
-                before,
-                extent.radius,
-                rounds,
-                linear,
-                far=far,
-                told=looks.told,
-                ask=ask,
-                looks=num_looks,
-            )
-        done += 10
-        show(Surface(distance=distance.cpu().numpy(), grid_from_world=extent.frame.object_from_world))
-        # looks take as long on any grid, and are left out where time is short
-        costs.append(GridCost(nodes=nodes, seconds=clock() - began_s - (looks.seconds - spent_s)))
-        if steps:
-            tell = within(progress, done / total, (done + steps) / total)
-            better = refine(scene, distance, steps, config.render, generator, tell, deadline)
-            distance = better.distance
-            rendered += better.steps
-            taken_back += better.taken_back
-            done += steps
-    progress(done / total, "detail")
+    looks = Looks(scene=extent.scene, linear=config.linear, deadline=deadline)
+    detail_from = 1 - _STEPS_OF_GRID / (_steps_of_grids(config) + _STEPS_OF_GRID)
+    tell = within(progress, 0.0, detail_from)
+    fit = _coarse_to_fine(extent, config, looks, generator=generator, progress=tell, show=show)
+    progress(detail_from, "detail")
     with torch.no_grad():
+        there_is_time = partial(_in_time, fit.costs[-1], config.rounds[-1], deadline)
         detailed, of_detail = add_detail(
-            scene,
-            torch.cat([torch.from_numpy(stereo.points.view_index).to(device), extent.faces.views]),
-            distance,
-            config.detail,
-            config.linear,
-            partial(_in_time, costs[-1], config.rounds[-1], deadline),
+            extent.scene, fit.distance, config.detail, config.linear, there_is_time
         )
-    made = (
-        *_decisions(extent, config, nodes=len(distance), rendered=rendered),
-        of_detail,
-        extent.faces.decision,
-        decision(told),
-        *looks.decisions,
-        _of_rendering(config, rendered, taken_back),
-    )
-    if config.budget_s is not None:
-        made = (*made, _of_budget(config.budget_s, deadline.left_s(), config, costs, rendered))
     return Surface(
         distance=detailed.cpu().numpy(),
         grid_from_world=extent.frame.object_from_world,
-        reach_cells=spacing(len(distance)) / spacing(len(detailed)),
-        decisions=made,
+        reach_cells=spacing(len(fit.distance)) / spacing(len(detailed)),
+        decisions=(
+            *_decisions(extent, config, fit),
+            of_detail,
+            extent.faces.decision,
+            decision(fit.far),
+            *looks.decisions,
+            _of_rendering(config, fit),
+            *_of_budget(config, fit, deadline),
+        ),
     )
 
 
@@ -180,6 +137,78 @@ def _extent(
     )
 
 
+@dataclass(frozen=True, kw_only=True)
+class _Fit:
+    """The field on the finest grid that there was time for, and how it came about."""
+
+    distance: Float[Tensor, "nodes nodes nodes"]
+    costs: Sequence[GridCost]
+    """Of all grids, that of the extent first."""
+    far: Sequence[FarSide]
+    """What was found behind bridges."""
+    rendered: int
+    """Gradient steps."""
+    taken_back: int
+    """Of these, how many led to what is no number."""
+
+
+def _coarse_to_fine(
+    extent: _Extent,
+    config: TrainConfig,
+    looks: Looks,
+    *,
+    generator: torch.Generator,
+    progress: Progress,
+    show: ShowSurface,
+) -> _Fit:
+    """Grid by grid the points fitted, then steps of rendering."""
+    scene, deadline, clock = extent.scene, looks.deadline, looks.deadline.clock
+    with torch.no_grad():
+        distance = start(scene, extent.radius, config.levels[0])
+    costs = [extent.cost]
+    found: list[FarSide] = []
+    total, done, rendered, taken_back = _steps_of_grids(config), 0, 0, 0
+    for level, (wanted, rounds, steps) in enumerate(
+        zip(config.levels, config.rounds, config.steps, strict=True)
+    ):
+        nodes = finest_grid(costs, len(distance), wanted, deadline.left_s())
+        if nodes == len(distance) < wanted:
+            break
+        progress(done / total, f"fitting points on a grid of {nodes}^3")
+        began_s = clock()
+        with torch.no_grad():
+            # bridges are seen in the first grid's field; finer ones than the second go on without them
+            is_second = config.linear.inner_outlines and len(costs) == 2
+            far = far_sides(scene, distance) if is_second else []
+            found += far
+            before = refined(distance, nodes)
+            spent_s = looks.seconds
+            is_last = level + 1 == len(config.levels)
+            linear, num_looks = looks.planned(before, _looks_wanted(config, level), is_last=is_last)
+            ask = looks.on_grid(num_looks, within(progress, done / total, (done + _STEPS_OF_GRID) / total))
+            radius, told = extent.radius, looks.told
+            distance = fit_level(
+                scene, before, radius, rounds, linear, far=far, told=told, ask=ask, looks=num_looks
+            )
+        done += _STEPS_OF_GRID
+        show(Surface(distance=distance.cpu().numpy(), grid_from_world=extent.frame.object_from_world))
+        # looks take as long on any grid, and are left out where time is short
+        costs.append(GridCost(nodes=nodes, seconds=clock() - began_s - (looks.seconds - spent_s)))
+        if steps:
+            tell = within(progress, done / total, (done + steps) / total)
+            better = refine(scene, distance, steps, config.render, generator, tell, deadline)
+            distance = better.distance
+            rendered += better.steps
+            taken_back += better.taken_back
+            done += steps
+    return _Fit(distance=distance, costs=costs, far=found, rendered=rendered, taken_back=taken_back)
+
+
+def _steps_of_grids(config: TrainConfig) -> int:
+    """Of rendering, that all grids take; for progress."""
+    return sum(config.steps) + _STEPS_OF_GRID * len(config.levels)
+
+
 def _in_time(last: GridCost, rounds: int, deadline: Deadline, nodes: int) -> bool:
     """Whether there is time for detail on so many nodes: it is like one of the `rounds` of the last grid."""
     return PESSIMISM * last.seconds / rounds * (nodes / last.nodes) ** 3 <= deadline.left_s()
@@ -192,28 +221,29 @@ def _looks_wanted(config: TrainConfig, level: int) -> int:
     return between if level else first
 
 
-def _of_budget(
-    budget_s: float, left_s: float, config: TrainConfig, costs: Sequence[GridCost], rendered: int
-) -> Decision:
-    """What the time was enough for."""
-    nodes, wanted, steps = costs[-1].nodes, config.levels[-1], sum(config.steps)
-    why = f"{budget_s:g} s given, {budget_s - left_s:.1f} s used"
+def _of_budget(config: TrainConfig, fit: _Fit, deadline: Deadline) -> tuple[Decision, ...]:
+    """What the time was enough for, where there is a limit."""
+    if config.budget_s is None:
+        return ()
+    nodes, wanted, steps = len(fit.distance), config.levels[-1], sum(config.steps)
+    why = f"{config.budget_s:g} s given, {config.budget_s - deadline.left_s():.1f} s used"
     if nodes < wanted:
         choice = f"stopped at a grid of {nodes}"
-        why += f"; a grid of {wanted} is predicted to take {predicted_s(costs, wanted):.1f} s"
-    elif rendered < steps:
-        choice = f"rendering stopped after {rendered} of {steps} steps"
+        why += f"; a grid of {wanted} is predicted to take {predicted_s(fit.costs, wanted):.1f} s"
+    elif fit.rendered < steps:
+        choice = f"rendering stopped after {fit.rendered} of {steps} steps"
     else:
         choice = "all that the preset asks for"
-    return Decision(what="budget", choice=choice, because=why)
+    return (Decision(what="budget", choice=choice, because=why),)
 
 
-def _decisions(extent: _Extent, config: TrainConfig, *, nodes: int, rendered: int) -> tuple[Decision, ...]:
+def _decisions(extent: _Extent, config: TrainConfig, fit: _Fit) -> tuple[Decision, ...]:
     """What was modelled and what was left out, with the measurement behind it."""
     masks = sum(outline is not None for outline in extent.scene.outlines)
     backdrops = sum(backdrop is not None for backdrop in extent.scene.backdrops)
+    nodes = len(fit.distance)
     cell = spacing(nodes) * extent.frame.radius_world
-    asked = _who_asked(config, nodes == config.levels[-1] and rendered == sum(config.steps))
+    asked = _who_asked(config, nodes == config.levels[-1] and fit.rendered == sum(config.steps))
     made = [
         Decision(
             what="grid",
@@ -231,12 +261,13 @@ def _decisions(extent: _Extent, config: TrainConfig, *, nodes: int, rendered: in
     return tuple(made)
 
 
-def _of_rendering(config: TrainConfig, rendered: int, taken_back: int) -> Decision:
+def _of_rendering(config: TrainConfig, fit: _Fit) -> Decision:
     """How many gradient steps there were, and whether all of them went well."""
+    rendered = fit.rendered
     what, because = "refinement by rendering", _who_asked(config, rendered == sum(config.steps))
-    if not taken_back:
+    if not fit.taken_back:
         return Decision(what=what, choice=f"{rendered} steps" if rendered else "left out", because=because)
-    numbers = not_finite(taken_back)
+    numbers = not_finite(fit.taken_back)
     if not rendered:
         return Decision(what=what, choice="left out", because=f"{numbers}; so the field before them stands")
     because += f"; {numbers}, were taken back and shortened"

@@ -9,11 +9,12 @@ from jaxtyping import Bool, Float64
 
 from ..images import fitted_size, resized
 from ..scene import Camera, Progress, View
-from .structure_from_motion import (
+from .features import (
     LensGroup,
     brightness,
     extract_features,
     match_pictures,
+    picture_index,
     picture_name,
     register_pictures,
 )
@@ -55,7 +56,7 @@ def _points_of_pairs(
 ) -> tuple[Float64[np.ndarray, "points 3"], Bool[np.ndarray, "points views"]]:
     positions, visibility = [np.zeros((0, 3))], [np.zeros((0, len(cameras)), bool)]
     with pycolmap.Database.open(database) as opened:
-        ids = {int(Path(image.name).stem): image.image_id for image in opened.read_all_images()}
+        ids = {picture_index(image.name): image.image_id for image in opened.read_all_images()}
         pixels = {i: np.asarray(opened.read_keypoints(ids[i]))[:, :2] for i in range(len(cameras))}
         for i in range(len(cameras)):
             for j in range(i + 1, len(cameras)):

@@ -10,7 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from backend.scene import SolvedCameras, no_progress
-from backend.stages import structure_from_motion
+from backend.stages import focal_search
 from backend.stages.cameras import CamerasConfig, solve_cameras
 from backend.stages.confirmation import FEWEST_CONFIRMING, num_confirming, unconfirmed
 from backend.stages.nerfstudio import OPENCV_FROM_OPENGL
@@ -126,13 +126,13 @@ def test_one_camera_has_one_focal_length_whatever_it_looks_at(tmp_path: Path) ->
     assert focal_px[0] == pytest.approx(focal_px[1], rel=0.03)
 
 
-@pytest.mark.parametrize("other_lenses", [(), structure_from_motion._OTHER_FOCAL_FACTORS], ids=["one", "all"])
+@pytest.mark.parametrize("other_lenses", [(), focal_search._OTHER_FOCAL_FACTORS], ids=["one", "all"])
 def test_three_dark_photographs_of_little_texture(
     other_lenses: tuple[float, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """With the usual features and a usual lens to begin with hardly anything confirms these cameras, and they
     are some 60 degrees wrong; fainter features, or a longer lens, mend that."""
-    monkeypatch.setattr(structure_from_motion, "_OTHER_FOCAL_FACTORS", other_lenses)
+    monkeypatch.setattr(focal_search, "_OTHER_FOCAL_FACTORS", other_lenses)
     folder = DATA / "photos_robovision_1"
     solved = solve([folder / "images" / f"image_camera0{number}.png" for number in (1, 2, 3)], tmp_path)
     assert solved.unplaced == ()

@@ -59,12 +59,8 @@ class Opened:
 
 
 @pytest.fixture(scope="module")
-def page(tmp_path_factory: pytest.TempPathFactory) -> str:
-    inputs = with_truth(
-        finished_run(num_photos=3, width=240, resolution=3),
-        tmp_path_factory.mktemp("truth") / "truth.ply",
-        resolution=3,
-    )
+def page() -> str:
+    inputs = with_truth(finished_run(num_photos=3, width=240, resolution=3), resolution=3)
     return render_report_html(build_report(inputs, ReportConfig(picture_px=120), progress=no_progress))
 
 

@@ -38,7 +38,7 @@ from backend.scene import (
     no_progress,
     transform_points,
 )
-from backend.stages import structure_from_motion
+from backend.stages import focal_search, mapping, model_choice
 from backend.stages.cameras import CamerasConfig, solve_cameras
 from backend.stages.known_cameras import read_cameras
 from backend.stages.mesh import MeshConfig, extract_mesh
@@ -149,7 +149,7 @@ def test_cameras_of_very_short_and_very_long_lenses_that_nothing_tells(
     photos, poses = ridge_from(focal_widths, told=False)
     solve = partial(solve_cameras, photos, None, CamerasConfig(), seed=0, progress=no_progress)
     assert worst_turn_deg(solve(workdir=tmp_path / "ours"), poses) < 1.0
-    monkeypatch.setattr(structure_from_motion, "_OTHER_FOCAL_FACTORS", ())
+    monkeypatch.setattr(focal_search, "_OTHER_FOCAL_FACTORS", ())
     usual_deg = worst_turn_deg(solve(workdir=tmp_path / "usual"), poses)
     assert (usual_deg > 20) == (focal_widths in (0.34, 105.0))
 
@@ -160,16 +160,16 @@ def test_of_many_photographs_a_few_tell_the_lens(
     focal_widths: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     photos, poses = ridge_from(focal_widths, told=False, angles_deg=(-18.0, -11.0, -4.0, 3.0, 9.0, 15.0))
-    mapped, tried = structure_from_motion._mapped, []
+    mapped, tried = model_choice.mapped_models, []
 
     def counting(*given: Any) -> list[pycolmap.Reconstruction]:
         tried.append(len(given[5]) if len(given) > 5 else 0)
         return mapped(*given)
 
-    monkeypatch.setattr(structure_from_motion, "_mapped", counting)
+    monkeypatch.setattr(model_choice, "mapped_models", counting)
     solve = partial(solve_cameras, photos, None, CamerasConfig(), seed=0, progress=no_progress)
     assert worst_turn_deg(solve(workdir=tmp_path / "ours"), poses) < 1.0
-    assert tried == [0, *4 * [structure_from_motion._FEW_PHOTOS]], "the usual lens and three others"
+    assert tried == [0, *4 * [focal_search.FEW_PHOTOS]], "the usual lens and three others"
 
 
 @pytest.mark.slow
@@ -177,7 +177,7 @@ def test_by_the_usual_bound_a_long_lens_has_no_cameras(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """COLMAP takes a focal length of more than ten widths for a mistake."""
-    monkeypatch.setattr(structure_from_motion, "_LONGEST_FOCAL_WIDTHS", 10.0)
+    monkeypatch.setattr(mapping, "_LONGEST_FOCAL_WIDTHS", 10.0)
     photos, _ = ridge_from(10.5)
     with pytest.raises(ReconstructionError) as caught:
         solve_cameras(photos, None, CamerasConfig(), workdir=tmp_path, seed=0, progress=no_progress)

@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from backend.errors import Cancelled, ErrorCode, ReconstructionError
 from backend.scene import Decision, Photo, SolvedCameras, no_progress
-from backend.stages import structure_from_motion
+from backend.stages import features, focal_search, model_choice, model_merit
 from backend.stages.camera_report import build_camera_report, camera_report_html, camera_report_numbers
 from backend.stages.cameras import CamerasConfig, solve_cameras
 from backend.stages.lens_refinement import Gaussian, joined, refine_lenses
@@ -195,8 +195,8 @@ def lens_kept(
     and of all; those made are (focal length, photographs).
     """
     PIL.Image.new("L", (64, 48)).save(tmp_path / "0000.png")
-    group = structure_from_motion.LensGroup(names=("0000.png",), width=64, height=48, focal_px=None)
-    structure_from_motion.register_pictures(tmp_path / "a.db", tmp_path, [group])
+    group = features.LensGroup(names=("0000.png",), width=64, height=48, focal_px=None)
+    features.register_pictures(tmp_path / "a.db", tmp_path, [group])
     begun: dict[Path, float] = {}
     made: list[tuple[float, int]] = []
     confirmed: dict[pycolmap.Reconstruction, int] = {}
@@ -210,11 +210,12 @@ def lens_kept(
         made.append((factor, len(names) or 20))
         return [model_with((few if names else whole)[factor])]
 
-    monkeypatch.setattr(structure_from_motion, "_begin_with", begun.__setitem__)
-    monkeypatch.setattr(structure_from_motion, "_num_threads", lambda: 1)
-    monkeypatch.setattr(structure_from_motion, "_few_that_share_most", lambda _: ["0", "1"])
-    monkeypatch.setattr(structure_from_motion, "_merit", lambda model: (20, confirmed[model], 0))
-    kept = structure_from_motion._with_another_lens(model_with(whole[1.2]), tmp_path / "a.db", mapped)
+    monkeypatch.setattr(focal_search, "_begin_with", begun.__setitem__)
+    monkeypatch.setattr(focal_search, "num_threads", lambda: 1)
+    monkeypatch.setattr(focal_search, "_few_that_share_most", lambda _: ["0", "1"])
+    for module in (model_merit, focal_search):
+        monkeypatch.setattr(module, "merit", lambda model: (20, confirmed[model], 0))
+    kept = focal_search.with_another_lens(model_with(whole[1.2]), tmp_path / "a.db", mapped)
     assert kept is not None
     assert tmp_path / "a.db" not in begun, "later attempts begin as usual"
     return confirmed[kept], made
@@ -256,16 +257,16 @@ def test_chance_is_drawn_again_for_few_photographs_and_else_until_all_are_confir
         "register_pictures": nothing,
         "extract_features": nothing,
         "match_pictures": match,
-        "_mapped": lambda *_: [pycolmap.Reconstruction()],
-        "_with_another_lens": lambda model, *_: model,
+        "mapped_models": lambda *_: [pycolmap.Reconstruction()],
+        "with_another_lens": lambda model, *_: model,
         "_is_enough": lambda *_: bool(drawn),
         "_why_fainter": lambda *_: Decision(what="features", choice="fainter ones", because="there are more"),
     }
     for name, fake in fakes.items():
-        monkeypatch.setattr(structure_from_motion, name, fake)
+        monkeypatch.setattr(model_choice, name, fake)
     names = tuple(f"{index:04d}.png" for index in range(num_photos))
-    group = structure_from_motion.LensGroup(names=names, width=64, height=48, focal_px=None)
-    structure_from_motion._best_model(tmp_path, [group], 1000, tmp_path, 7, no_progress)
+    group = features.LensGroup(names=names, width=64, height=48, focal_px=None)
+    model_choice.best_model(tmp_path, [group], 1000, workdir=tmp_path, seed=7, progress=no_progress)
     assert drawn == list(range(7, 7 + num_draws))
 
 
@@ -275,24 +276,22 @@ def test_of_large_photographs_features_are_sought_finely_where_there_are_few(
 ) -> None:
     names = tuple(f"{index:04d}.png" for index in range(3))
     for name, photo in zip(names, corner, strict=True):
-        grey = structure_from_motion.brightness(photo.image_srgb)
+        grey = features.brightness(photo.image_srgb)
         PIL.Image.fromarray(grey).save(tmp_path / name)
-    group = structure_from_motion.LensGroup(names=names, width=WIDTH, height=HEIGHT, focal_px=None)
+    group = features.LensGroup(names=names, width=WIDTH, height=HEIGHT, focal_px=None)
 
     def found(database: Path, few_pixels: int, fine_pixels: int) -> list[int]:
-        monkeypatch.setattr(structure_from_motion, "_FEW_PIXELS", few_pixels)
-        monkeypatch.setattr(structure_from_motion, "_FINE_PIXELS", fine_pixels)
-        structure_from_motion.register_pictures(database, tmp_path, [group])
-        structure_from_motion.extract_features(
-            database, tmp_path, [group], 5000, sensitive=False, progress=no_progress
-        )
+        monkeypatch.setattr(features, "_FEW_PIXELS", few_pixels)
+        monkeypatch.setattr(features, "_FINE_PIXELS", fine_pixels)
+        features.register_pictures(database, tmp_path, [group])
+        features.extract_features(database, tmp_path, [group], 5000, sensitive=False, progress=no_progress)
         with pycolmap.Database.open(database) as opened:
             return [opened.num_keypoints_for_image(image.image_id) for image in opened.read_all_images()]
 
     fine = found(tmp_path / "fine.db", 10**9, 10**9)
     coarse = found(tmp_path / "coarse.db", 0, 0)
     assert min(fine) > 1.5 * max(coarse)
-    monkeypatch.setattr(structure_from_motion, "_PLENTY", plenty)
+    monkeypatch.setattr(features, "_PLENTY", plenty)
     assert found(tmp_path / "asked.db", 0, 10**9) == (fine if is_fine else coarse)
 
 
@@ -302,8 +301,8 @@ def test_a_few_large_photographs_are_looked_at_smaller(num_photos: int, side_px:
     large = replace(
         make_photo("a.png", np.zeros((4, 6, 3), np.float32)), original_width=3072, original_height=2048
     )
-    assert structure_from_motion._picture_side_px(num_photos * [large], 1600) == side_px
-    assert structure_from_motion._picture_side_px(num_photos * [large], 800) == 800
+    assert features._picture_side_px(num_photos * [large], 1600) == side_px
+    assert features._picture_side_px(num_photos * [large], 800) == 800
 
 
 def test_progress_can_cancel(corner: list[Photo], tmp_path: Path) -> None:
@@ -322,7 +321,7 @@ def test_progress_can_cancel(corner: list[Photo], tmp_path: Path) -> None:
 def test_a_run_is_cancelled_while_it_tries_other_lenses(
     corner: list[Photo], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(structure_from_motion, "_num_threads", lambda: 2)
+    monkeypatch.setattr(focal_search, "num_threads", lambda: 2)
     threads = set()
 
     def cancel(_share: float, text: str) -> None:

@@ -35,8 +35,8 @@ def camera(focal_px: float) -> Pinhole:
     return Pinhole(camera_from_object=from_object, intrinsics=intrinsics, width=200, height=200)
 
 
-def measured(noise: float = 0.0, focal_px: float = 200.0) -> tuple[Measurements, Tensor]:
-    """The wave over the half x < 0 of the plane z = 0, as two views see it; and the view of each point."""
+def measured(noise: float = 0.0, focal_px: float = 200.0) -> Measurements:
+    """The wave over the half x < 0 of the plane z = 0, as two views see it."""
     generator = torch.Generator().manual_seed(0)
     places = torch.rand((40_000, 2), generator=generator) * torch.tensor([1.0, 2.0]) - 1
     views = torch.arange(len(places)) % 2
@@ -44,7 +44,7 @@ def measured(noise: float = 0.0, focal_px: float = 200.0) -> tuple[Measurements,
     slope = -HEIGHT * 2 * math.pi / WAVE * torch.sin(2 * math.pi / WAVE * places[:, 0])
     normals = torch.stack([-slope, torch.zeros_like(slope), torch.ones_like(slope)], dim=-1)
     none: list[Tensor | None] = [None, None]
-    scene = Measurements(
+    return Measurements(
         cameras=[camera(focal_px)] * 2,
         images=[torch.zeros(3, 200, 200)] * 2,
         masks=none,
@@ -57,10 +57,10 @@ def measured(noise: float = 0.0, focal_px: float = 200.0) -> tuple[Measurements,
         normals=torch.nn.functional.normalize(normals, dim=-1),
         colours=torch.zeros(len(places), 3),
         confidence=torch.ones(len(places)),
+        view_index=views,
         region_centre=torch.zeros(3),
         region_radius=1.0,
     )
-    return scene, views
 
 
 def flat() -> Float[Tensor, "nodes nodes nodes"]:
@@ -70,8 +70,7 @@ def flat() -> Float[Tensor, "nodes nodes nodes"]:
 def detailed(
     most: int = FINE, *, noise: float = 0.0, focal_px: float = 200.0, there_is_time: bool = True
 ) -> tuple[Tensor, Decision]:
-    scene, views = measured(noise, focal_px)
-    return add_detail(scene, views, flat(), most, LinearConfig(), lambda _: there_is_time)
+    return add_detail(measured(noise, focal_px), flat(), most, LinearConfig(), lambda _: there_is_time)
 
 
 def test_the_wave_is_there_and_what_was_not_measured_is_as_it_was() -> None:
@@ -111,11 +110,11 @@ def test_the_grid_is_as_fine_as_photographs_agree() -> None:
 
 
 def test_without_points_there_is_no_detail() -> None:
-    scene, views = measured()
-    none = torch.zeros(len(views), dtype=torch.bool)
-    names = ("positions", "normals", "colours", "confidence")
+    scene = measured()
+    none = torch.zeros(len(scene.positions), dtype=torch.bool)
+    names = ("positions", "normals", "colours", "confidence", "view_index")
     empty = replace(scene, **{name: getattr(scene, name)[none] for name in names})
-    distance, decision = add_detail(empty, views[none], flat(), FINE, LinearConfig(), lambda _: True)
+    distance, decision = add_detail(empty, flat(), FINE, LinearConfig(), lambda _: True)
     assert (len(distance), decision.choice) == (COARSE, "left out")
     assert "hardly any place was measured by two photographs" in decision.because
 

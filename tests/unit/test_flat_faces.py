@@ -75,6 +75,7 @@ def measurements(
         normals=NORMAL.expand_as(positions),
         colours=torch.zeros_like(positions),
         confidence=torch.full((len(positions),), 0.8),
+        view_index=torch.zeros(len(positions), dtype=torch.long),
         region_centre=torch.zeros(3),
         region_radius=1.0,
     )

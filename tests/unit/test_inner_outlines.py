@@ -94,6 +94,7 @@ def scene(*, contrast: float = 0.4) -> Measurements:
         normals=F.normalize(positions - middle, dim=-1),
         colours=torch.zeros_like(positions),
         confidence=torch.full((len(positions),), 0.8),
+        view_index=torch.zeros(len(positions), dtype=torch.long),
         region_centre=torch.zeros(3),
         region_radius=1.0,
     )

@@ -11,7 +11,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from backend.scene import no_progress
-from backend.stages import structure_from_motion
+from backend.stages import features, focal_search, model_merit
 from backend.stages.bundle_adjustment import adjust_bundle
 from backend.stages.cameras import CamerasConfig, solve_cameras
 from backend.stages.lens_doubt import contradicted_lenses
@@ -89,8 +89,8 @@ def test_clearly_better_is_more_photographs_or_a_twentieth_more_confirmed_points
 ) -> None:
     """What only two photographs see says nothing: a tie is a tie whatever their number."""
     merits = {(one := pycolmap.Reconstruction()): merit, (other := pycolmap.Reconstruction()): than}
-    monkeypatch.setattr(structure_from_motion, "_merit", merits.__getitem__)
-    assert structure_from_motion._is_clearly_better(one, other) == better
+    monkeypatch.setattr(model_merit, "merit", merits.__getitem__)
+    assert model_merit.is_clearly_better(one, other) == better
 
 
 @pytest.mark.parametrize(
@@ -103,11 +103,11 @@ def test_without_exif_cameras_are_kept_if_confirmed_and_not_clearly_worse(
     for name, width in zip(names, (64, 60), strict=True):
         PIL.Image.new("L", (width, 48)).save(tmp_path / name)
     groups = [
-        structure_from_motion.LensGroup(names=(name,), width=width, height=48, focal_px=50.0)
+        features.LensGroup(names=(name,), width=width, height=48, focal_px=50.0)
         for name, width in zip(names, (64, 60), strict=True)
     ]
     database = tmp_path / "a.db"
-    structure_from_motion.register_pictures(database, tmp_path, groups)
+    features.register_pictures(database, tmp_path, groups)
     usual, other = pycolmap.Reconstruction(), pycolmap.Reconstruction()
     merits = {usual: (3, 100, 0), other: (3, confirmed, 0)}
     told: list[dict[int, tuple[bool, float]]] = []
@@ -119,10 +119,11 @@ def test_without_exif_cameras_are_kept_if_confirmed_and_not_clearly_worse(
             told.append({lens.camera_id: (lens.has_prior_focal_length, lens.focal_length) for lens in lenses})
         return [other]
 
-    monkeypatch.setattr(structure_from_motion, "_merit", merits.__getitem__)
-    monkeypatch.setattr(structure_from_motion, "_fewest_confirming", lambda _: fewest)
-    monkeypatch.setattr(structure_from_motion, "contradicted_lenses", lambda _: {2})
-    kept = structure_from_motion._without_contradicted_exif(usual, database, mapped)
+    for module in (model_merit, focal_search):
+        monkeypatch.setattr(module, "merit", merits.__getitem__)
+    monkeypatch.setattr(focal_search, "fewest_confirming", lambda _: fewest)
+    monkeypatch.setattr(focal_search, "contradicted_lenses", lambda _: {2})
+    kept = focal_search.without_contradicted_exif(usual, database, mapped)
     assert (kept is other) == is_taken
     assert told == [{1: (True, 50.0), 2: (False, 1.2 * 60)}, {1: (True, 50.0), 2: (True, 50.0)}]
 

@@ -39,6 +39,7 @@ def test_apples_gpu_is_taken_only_where_it_is_asked_for(
     monkeypatch: pytest.MonkeyPatch, there: tuple[str, ...], taken: str
 ) -> None:
     monkeypatch.setattr(machine, "available_devices", lambda: dict.fromkeys(there, "a name"))
+    monkeypatch.setattr(torch.cuda, "mem_get_info", lambda: (8_000_000_000, 8_000_000_000))
     assert machine.choose_device("auto").type == taken
     assert [machine.choose_device(kind).type for kind in there] == list(there)
     with pytest.raises(ReconstructionError, match="not available"):
@@ -76,6 +77,7 @@ def gtx_1080(monkeypatch: pytest.MonkeyPatch) -> pytest.MonkeyPatch:
     monkeypatch.setattr(torch.cuda, "get_device_name", lambda: "NVIDIA GeForce GTX 1080")
     monkeypatch.setattr(torch.cuda, "get_device_capability", lambda: (6, 1))
     monkeypatch.setattr(torch.cuda, "get_arch_list", lambda: ["sm_75", "sm_80", "sm_86", "sm_90"])
+    monkeypatch.setattr(torch.cuda, "mem_get_info", lambda: (8_000_000_000, 8_000_000_000))
     return monkeypatch
 
 
@@ -97,3 +99,22 @@ def test_a_driver_that_fails_leaves_the_cpu(gtx_1080: pytest.MonkeyPatch) -> Non
     assert machine.choose_device("auto").type == "cpu"
     with pytest.raises(ReconstructionError, match=r"\(GPU: CUDA error: unknown error\)"):
         machine.choose_device("cuda")
+
+
+@pytest.mark.parametrize(("free_bytes", "told_gb"), [(1_400_000_000, "1.4"), (None, "0.0")])
+def test_a_gpu_whose_memory_others_hold_is_taken_only_where_it_is_asked_for(
+    gtx_1080: pytest.MonkeyPatch, free_bytes: int | None, told_gb: str
+) -> None:
+    def memory() -> tuple[int, int]:
+        if free_bytes is None:
+            raise torch.OutOfMemoryError("CUDA error: out of memory")
+        return free_bytes, 8_000_000_000
+
+    gtx_1080.setattr(torch.cuda, "get_device_capability", lambda: (8, 6))
+    gtx_1080.setattr(torch.cuda, "mem_get_info", memory)
+    told: list[str] = []
+    assert machine.choose_device("auto", told.append).type == "cpu"
+    (text,) = told
+    assert f"only {told_gb} GB are free" in text
+    assert machine.choose_device("cuda", told.append).type == "cuda"
+    assert told == [text]

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from PIL import ExifTags, Image
 
 from backend import pipeline, workspace
@@ -100,6 +101,16 @@ def kept_after(job: Job, change: Callable[[], object]) -> tuple[str, ...]:
     listener = Quiet()
     up_to_the_cameras(job, listener)
     return listener.kept
+
+
+def test_a_gpu_that_is_left_aside_is_told(photos: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def choose(_: str, warn: Callable[[str], object]) -> torch.device:
+        warn("The CPU is used.")
+        return torch.device("cpu")
+
+    monkeypatch.setattr(pipeline, "choose_device", choose)
+    _, warned = found_and_warned(job_of(photos))
+    assert warned == ["The CPU is used."]
 
 
 def test_photographs_that_were_moved_are_read_from_where_they_are(photos: Path) -> None:

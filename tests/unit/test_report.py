@@ -16,7 +16,7 @@ import trimesh
 from PIL import Image
 
 from backend.benchmark import measuring
-from backend.errors import Cancelled, ErrorCode, ReconstructionError
+from backend.errors import Cancelled
 from backend.maths.raycast import MeshImage, render_mesh
 from backend.maths.upright import up_direction
 from backend.report_page import pictures
@@ -52,10 +52,9 @@ def small_run(wobble: float = 0.03, *, num_photos: int = 3, masked: bool = True)
 
 
 @pytest.fixture(scope="module")
-def measured(tmp_path_factory: pytest.TempPathFactory) -> Report:
+def measured() -> Report:
     """A report with everything in it."""
-    truth = tmp_path_factory.mktemp("truth") / "truth.ply"
-    return build_report(with_truth(small_run(), truth, resolution=2), SMALL, progress=no_progress)
+    return build_report(with_truth(small_run(), resolution=2), SMALL, progress=no_progress)
 
 
 class Page(HTMLParser):
@@ -195,9 +194,9 @@ def test_numbers_survive_json_and_say_their_units(measured: Report) -> None:
 
 
 @pytest.fixture
-def doubted(tmp_path: Path) -> Report:
+def doubted() -> Report:
     """The true mesh with support 0.9, and around it the same, a fifth too large, with 0.1."""
-    inputs = with_truth(small_run(wobble=0.0, num_photos=1), tmp_path / "truth.ply", resolution=2)
+    inputs = with_truth(small_run(wobble=0.0, num_photos=1), resolution=2)
     mesh = inputs.mesh
     there = mesh.vertices * 1.2
     both = SurfaceMesh(
@@ -268,9 +267,9 @@ def test_pictures_are_what_they_say(measured: Report) -> None:
     assert measured.photos[1].panels == (), "the middle one of three when two are shown"
 
 
-def test_error_maps_are_dark_red_where_the_error_is_large(tmp_path: Path) -> None:
+def test_error_maps_are_dark_red_where_the_error_is_large() -> None:
     """A mesh a sixth too large is off by more than the map's limit almost everywhere, a true one nowhere."""
-    inputs = with_truth(small_run(wobble=0.0, num_photos=1), tmp_path / "truth.ply", resolution=2)
+    inputs = with_truth(small_run(wobble=0.0, num_photos=1), resolution=2)
     large = replace(inputs, mesh=replace(inputs.mesh, vertices=inputs.mesh.vertices * 1.16))
     middle_colours = []
     for run in (inputs, large):
@@ -353,11 +352,9 @@ def test_a_photograph_the_mesh_does_not_reach_has_no_likeness() -> None:
     render_report_html(report)
 
 
-def test_a_truth_of_another_scale_is_measured_by_few_samples(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_truth_of_another_scale_is_measured_by_few_samples(monkeypatch: pytest.MonkeyPatch) -> None:
     """Else that takes an hour."""
-    inputs = with_truth(small_run(num_photos=1), tmp_path / "truth.ply", resolution=2)
+    inputs = with_truth(small_run(num_photos=1), resolution=2)
     asked: list[int] = []
     measure = report.surface_error
 
@@ -366,23 +363,15 @@ def test_a_truth_of_another_scale_is_measured_by_few_samples(
         return measure(*args, num_samples=num_samples, **kwargs)
 
     monkeypatch.setattr(report, "surface_error", counted)
-    for scale in (1.0, 1000.0):
-        truth = trimesh.load(tmp_path / "truth.ply")
-        truth.apply_scale(scale).export(tmp_path / "scaled.ply")
-        build_report(replace(inputs, truth=tmp_path / "scaled.ply"), SMALL, progress=no_progress)
+    for elsewhere in (False, True):
+        build_report(replace(inputs, truth_elsewhere=elsewhere), SMALL, progress=no_progress)
     assert asked == [SMALL.error_samples, 2000]
 
 
-def test_an_unreadable_truth_is_told(tmp_path: Path) -> None:
-    with pytest.raises(ReconstructionError) as caught:
-        build_report(replace(small_run(), truth=tmp_path / "none.ply"), SMALL, progress=no_progress)
-    assert caught.value.code is ErrorCode.TRUTH_UNREADABLE
-
-
-def test_progress_goes_forward_and_can_cancel(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_progress_goes_forward_and_can_cancel(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(torch, "get_num_threads", lambda: 1)
     fractions: list[float] = []
-    inputs = with_truth(small_run(), tmp_path / "truth.ply", resolution=2)
+    inputs = with_truth(small_run(), resolution=2)
     build_report(inputs, SMALL, progress=lambda fraction, _: fractions.append(fraction))
     assert fractions == sorted(set(fractions))
     assert len(fractions) == 7, "three photographs, the truth, three other sides"

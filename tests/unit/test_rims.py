@@ -129,6 +129,7 @@ def seen(
         normals=normals,
         colours=normals.abs(),
         confidence=torch.ones(len(measured)),
+        view_index=torch.zeros(len(measured), dtype=torch.long),
         region_centre=torch.zeros(3),
         region_radius=1.0,
     )

@@ -85,6 +85,7 @@ def scene(
         normals=F.normalize(points, dim=-1),
         colours=torch.zeros_like(points),
         confidence=torch.full((len(points),), 0.8),
+        view_index=torch.zeros(len(points), dtype=torch.long),
         region_centre=torch.zeros(3),
         region_radius=1.0,
     )
@@ -416,6 +417,7 @@ def test_lines_of_points_with_tilted_normals_dent_what_is_plain_less() -> None:
         normals=torch.cat([ball.normals, tilted]),
         colours=torch.zeros(len(ball.colours) + 4000, 3),
         confidence=torch.cat([ball.confidence, torch.full((4000,), 0.8)]),
+        view_index=torch.zeros(len(ball.colours) + 4000, dtype=torch.long),
     )
 
     def dents_deg(config: LinearConfig) -> float:

@@ -88,6 +88,7 @@ def seen(azimuths_deg: list[float], back: float, *, measured_from: float = 0.4) 
         normals=normals[chosen],
         colours=torch.zeros(count, 3),
         confidence=torch.ones(count),
+        view_index=torch.zeros(count, dtype=torch.long),
         region_centre=torch.zeros(3),
         region_radius=1.0,
     )
@@ -183,7 +184,14 @@ def reaching(azimuths_deg: list[float], depth: float) -> Measurements:
     scene = seen(azimuths_deg, -0.5)
     along = torch.linspace(0.0, depth, 1001)[:, None] * torch.eye(3)[0]
     normals = torch.eye(3)[:1].expand_as(along)
-    return replace(scene, positions=along, normals=normals, colours=along, confidence=along[:, 0] + 1)
+    return replace(
+        scene,
+        positions=along,
+        normals=normals,
+        colours=along,
+        confidence=along[:, 0] + 1,
+        view_index=torch.zeros(len(along), dtype=torch.long),
+    )
 
 
 def test_the_other_side_is_as_deep_as_what_was_measured(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -202,6 +210,7 @@ def test_the_other_side_is_as_deep_as_what_was_measured(monkeypatch: pytest.Monk
     assert "so deep is what was measured" in why.because
     nothing = torch.zeros((0, 3))
     none = {"positions": nothing, "normals": nothing, "colours": nothing, "confidence": nothing[:, 0]}
+    none["view_index"] = nothing[:, 0].long()
     without = replace(reaching(azimuths, 0.3), **none)
     assert seen_depth(without) == 0.0
 
