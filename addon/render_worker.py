@@ -8,7 +8,7 @@ import platform
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
 
@@ -29,6 +29,8 @@ from ..backend.wire.protocol import (
     Warned,
 )
 from ..backend.wire.speaker import Speaker, speaker
+from .kept_settings import changed
+from .simulations import Kept, bake_folders, simulations
 from .view_rendering import ViewRequest, decode_request, encode_request, render_views
 
 COPY, REQUEST, LOG = "scene.blend", "request.json", "render.log"
@@ -46,15 +48,19 @@ def prepare(scene: bpy.types.Scene, request: ViewRequest, folder: Path) -> None:
     """Write what the second Blender reads: the request, and the scene with all that it uses.
 
     Not by saving a copy of the file, which takes longer and runs the user's handlers; but where there are
-    simulations, whose frames are in nothing else.
+    simulations or bakes, which are in nothing else.
     Raises RuntimeError or OSError where the copy cannot be written.
     """
     (folder / REQUEST).write_text(encode_request(request), encoding="utf-8")
     if bpy.ops.ed.flush_edits.poll():
         bpy.ops.ed.flush_edits()  # what is being edited or sculpted
     copy = str(folder / COPY)
-    if any(_simulations(scene, request)):
-        bpy.ops.wm.save_as_mainfile(filepath=copy, copy=True, compress=False, check_existing=False)
+    folders = bake_folders(scene)
+    if folders or any(
+        made.kept is not Kept.IN_MEMORY for made in simulations(scene, _last_frame(scene, request))
+    ):
+        with changed(folders):
+            bpy.ops.wm.save_as_mainfile(filepath=copy, copy=True, compress=False, check_existing=False)
         return
     blocks = {scene, *bpy.data.texts}  # drivers may call what a text defines
     bpy.data.libraries.write(copy, blocks, path_remap="ABSOLUTE", compress=False)
@@ -62,32 +68,20 @@ def prepare(scene: bpy.types.Scene, request: ViewRequest, folder: Path) -> None:
 
 def not_copied(scene: bpy.types.Scene, request: ViewRequest) -> tuple[str, ...]:
     """What the second Blender has not, or not as it is here, in sentences for the user."""
-    painted = [image.name for image in bpy.data.images if image.is_dirty]
-    on_disk = [name for name, cache in _simulations(scene, request) if cache.use_disk_cache]
+    begun = simulations(scene, _last_frame(scene, request))
     sentences = {
-        "Rendered as they were last saved or packed": painted,
-        "Rendered without what is simulated in a cache on disk": on_disk,
+        "Rendered as they were last saved or packed": [
+            image.name for image in bpy.data.images if image.is_dirty
+        ],
+        "Rendered without what is simulated in a cache on disk": [
+            made.name for made in begun if made.kept is Kept.ON_DISK
+        ],
     }
     return tuple(f"{what}: {', '.join(dict.fromkeys(names))}" for what, names in sentences.items() if names)
 
 
-def _simulations(scene: bpy.types.Scene, request: ViewRequest) -> Iterator[tuple[str, bpy.types.PointCache]]:
-    """Names of objects, and what was simulated of them before the frames of the views."""
-    last = max(scene.frame_current if view.frame is None else view.frame for view in request.views)
-    for made in scene.objects:
-        yield from ((made.name, cache) for cache in _point_caches(made) if cache.frame_start < last)
-
-
-def _point_caches(made: bpy.types.Object) -> Iterator[bpy.types.PointCache]:
-    for modifier in made.modifiers:
-        if hasattr(modifier, "point_cache"):  # cloth and soft bodies
-            yield modifier.point_cache
-        canvas = getattr(modifier, "canvas_settings", None)
-        if canvas is not None:
-            yield from (surface.point_cache for surface in canvas.canvas_surfaces)
-    for system in made.particle_systems:
-        if system.settings.type != "HAIR" or system.use_hair_dynamics:
-            yield system.point_cache
+def _last_frame(scene: bpy.types.Scene, request: ViewRequest) -> int:
+    return max(scene.frame_current if view.frame is None else view.frame for view in request.views)
 
 
 def clean(folder: Path) -> None:
@@ -151,6 +145,7 @@ def _render(folder: Path, asked: CancelRequest, speaking: Speaker) -> Message:
         if bpy.app.autoexec_fail:
             text = "Python in this file was not run for the views, as Auto Run Python Scripts is off"
             speaking.say(Warned(text=text))
+        _play(bpy.context.scene, request, asked, speaking)
         return _say_views(request, folder, asked, speaking)
     except Cancelled:
         return _cancelled()
@@ -171,6 +166,18 @@ def _take_over(folder: Path) -> ViewRequest:
     window = bpy.context.window_manager.windows[0]
     window.scene, window.view_layer = scene, scene.view_layers[request.view_layer]
     return request
+
+
+def _play(scene: bpy.types.Scene, request: ViewRequest, asked: CancelRequest, speaking: Speaker) -> None:
+    """Simulate what the copy does not hold, frame by frame, up to the last that is rendered."""
+    shown, last = scene.frame_current, _last_frame(scene, request)
+    firsts = [made.first_frame for made in simulations(scene, last) if made.kept is Kept.IN_MEMORY]
+    for frame in range(min(firsts, default=last + 1), last + 1):
+        asked.check()
+        text = f"simulating frame {frame} of {last}"
+        speaking.say(Progress(stage=STAGE, fraction=0.0, text=text, remaining_s=None))
+        scene.frame_set(frame)
+    scene.frame_set(shown)
 
 
 def _say_views(request: ViewRequest, folder: Path, asked: CancelRequest, speaking: Speaker) -> Message:

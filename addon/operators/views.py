@@ -179,8 +179,6 @@ class FEWVIEW_OT_render_views(bpy.types.Operator):
         )
 
     def _start(self, scene: bpy.types.Scene, request: ViewRequest, folder: Path) -> None:
-        for sentence in render_worker.not_copied(scene, request):
-            self.report({"WARNING"}, sentence)
         render_worker.prepare(scene, request, folder)
         scene_uid = scene.session_uid
         jobs.start(
@@ -194,6 +192,9 @@ class FEWVIEW_OT_render_views(bpy.types.Operator):
             environment=os.environ,
             noisy_start=True,
         )
+        running = jobs.running()
+        if running is not None:
+            running.warnings += render_worker.not_copied(scene, request)
 
 
 def take_views(scene_uid: int, folder: Path) -> Iterator[None]:
