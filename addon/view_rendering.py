@@ -18,6 +18,7 @@ import numpy as np
 from .camera_lens import pinhole_of, world_from_camera
 from .kept_settings import Change, changed
 from .png import critical_chunks
+from .scenes import object_named
 from .solved import SolvedCamera, write_cameras
 from .true_mesh import TrueMesh, as_rendered, instanced_by, rendered_objects, subject_of, true_mesh, write_ply
 
@@ -81,8 +82,8 @@ def render_views(request: ViewRequest, folder: Path) -> Generator[tuple[int, Pat
         raise ValueError(f"{request.scene}, {request.view_layer} is not what Blender shows")
     if not request.views:
         raise ValueError("there are no cameras to render from")
-    subject = () if request.target is None else _subject(_object(scene, request.target))
-    cameras = [_object(scene, view.camera) for view in request.views if view.camera]
+    subject = () if request.target is None else _subject(object_named(scene, request.target))
+    cameras = [object_named(scene, view.camera) for view in request.views if view.camera]
     (folder / IMAGES).mkdir(parents=True)
     taken: list[SolvedCamera] = []
     is_seen = False
@@ -232,7 +233,7 @@ def _go_to(scene: bpy.types.Scene, view: View) -> None:
     else:
         scene.frame_set(view.frame)  # a marker may change the scene's camera here
     if view.camera:
-        scene.camera = _object(scene, view.camera)
+        scene.camera = object_named(scene, view.camera)
     if scene.camera is None:
         raise ValueError("the scene has no camera: add one, or render from other cameras")
     bpy.context.view_layer.update()
@@ -262,13 +263,6 @@ def _shows_something(path: Path) -> bool:
     finally:
         bpy.data.images.remove(image)
     return bool(values[3::4].any())
-
-
-def _object(scene: bpy.types.Scene, full_name: str) -> bpy.types.Object:
-    found = next((made for made in scene.objects if made.name_full == full_name), None)
-    if found is None:
-        raise ValueError(f"there is no object {full_name} in the scene")
-    return found
 
 
 def _subject(target: bpy.types.Object) -> tuple[bpy.types.Object, ...]:

@@ -18,6 +18,7 @@ from ..job_folder import LOG, can_be_rendered, inside, new_folder, results_in
 from ..placing import solved_from_camera
 from ..properties import settings_of
 from ..result_mesh import result_or_none
+from ..scenes import object_or_none
 from ..solved import SolvedCamera, write_cameras
 from ..view_rendering import IMAGES, TRANSFORMS
 from .environment import backend_python_or_reason, reason_against_a_job
@@ -84,7 +85,7 @@ def _cameras(context: bpy.types.Context, names: str) -> list[bpy.types.Object]:
     """Those of the names, one a line, or else the selected ones, or else the scene's. Raises ValueError."""
     found = []
     for name in filter(None, map(str.strip, names.splitlines())):
-        made = context.scene.objects.get(name)
+        made = object_or_none(context.scene, name)
         if made is None or made.type != "CAMERA":
             raise ValueError(f"There is no camera {name} in the scene")
         found.append(made)

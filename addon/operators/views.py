@@ -223,10 +223,7 @@ def _target(context: bpy.types.Context, operator: bpy.types.Operator) -> bpy.typ
         return in_scene(context.scene, settings_of(context).target)
     if not operator.target:
         return None
-    found = object_named(context.scene, operator.target)
-    if found is None:
-        raise ValueError(f"There is no object {operator.target} in the scene")
-    return found
+    return object_named(context.scene, operator.target)
 
 
 def _views(context: bpy.types.Context, source: str, frame_step: int) -> tuple[View, ...]:

@@ -221,6 +221,26 @@ def test_the_selected_cameras_else_the_scenes(result: Any, started: list[tuple[s
     assert written(3) == ["images/b.png"]
 
 
+def test_a_linked_camera_of_the_same_name_is_another_one(
+    result: Any, started: list[tuple[str, ...]], tmp_path: Path
+) -> None:
+    points = world_points(result)
+    other = camera("Camera", points, (0, 0, 1))
+    bpy.data.libraries.write(str(tmp_path / "other.blend"), {other}, fake_user=True)
+    bpy.data.objects.remove(other)
+    with bpy.data.libraries.load(str(tmp_path / "other.blend"), link=True) as (_, wanted):
+        wanted.objects = ["Camera"]
+    (linked,) = wanted.objects
+    bpy.context.scene.collection.objects.link(linked)
+    own = camera("Camera", points, (1, 0, 0))
+    assert own.name == linked.name
+    assert bpy.ops.fewview.render_novel_views(cameras=f"{linked.name_full}\nCamera") == {"FINISHED"}
+    written = frames(job_of(result) / "novel-views-001")
+    assert [frame["file_path"] for frame in written] == ["images/Camera.png", "images/Camera_2.png"]
+    for made, frame in zip((linked, own), written, strict=True):
+        np.testing.assert_allclose(seen_by_the_job(frame), seen_by_blender(made, points), atol=0.05)
+
+
 def test_pictures_have_names_that_any_disk_can_keep(result: Any, started: list[tuple[str, ...]]) -> None:
     for name in ("Camera.001", "camera_001", "../up", "Büste"):
         camera(name, world_points(result), (1, 0, 0))
