@@ -8,6 +8,7 @@ from bpy.props import BoolProperty, EnumProperty, StringProperty
 
 from .. import result_mesh
 from ..camera_objects import JOB
+from ..frames import chosen_job_or_none
 from ..job_folder import (
     CAMERAS_PAGE,
     REPORT_NUMBERS,
@@ -129,12 +130,11 @@ class FEWVIEW_OT_open_report(_OnFolder, bpy.types.Operator):
 
 
 def camera_page_or_none(context: bpy.types.Context) -> Path | None:
-    """What the job that found the cameras alone tells of them; None where there was none, or it is gone."""
-    chosen = settings_of(context).cameras_job
-    folder = Path(bpy.path.abspath(chosen))
+    """What the job tells of the cameras that step 2 is set to; None where none found them, or it is gone."""
+    folder = chosen_job_or_none(settings_of(context))
     try:
-        page = inside(folder, results_in(folder) / CAMERAS_PAGE)
-        return page if chosen and page.is_file() else None
+        page = None if folder is None else inside(folder, results_in(folder) / CAMERAS_PAGE)
+        return page if page is not None and page.is_file() else None
     except (FolderError, OSError):
         return None
 
