@@ -90,6 +90,7 @@ def render_views(request: ViewRequest, folder: Path) -> Generator[tuple[int, Pat
     changes = (
         *_marker_changes(scene, request),
         *render_changes(scene, request),
+        *(_fog_changes(scene) if subject else ()),
         *camera_changes(scene, cameras),
     )
     with _same_frame(scene), changed(changes):
@@ -152,6 +153,7 @@ def render_changes(scene: bpy.types.Scene, request: ViewRequest) -> tuple[Change
         (view, "look", "None"),
         (view, "gamma", 1.0),
         (view, "use_curve_mapping", False),
+        (scene.display.shading, "show_xray", False),  # Workbench's: the mask would be half transparent
         *((cycles, name, value) for name, value in of_cycles.items() if cycles is not None),
         (scene, "camera", scene.camera),
     )
@@ -169,6 +171,14 @@ def _marker_changes(scene: bpy.types.Scene, request: ViewRequest) -> tuple[Chang
     if not all(view.camera for view in request.views):
         return ()
     return tuple((marker, "camera", None) for marker in scene.timeline_markers if marker.camera)
+
+
+def _fog_changes(scene: bpy.types.Scene) -> tuple[Change, ...]:
+    """Without the world's volume: it lies before everything, and so all of a picture would be in the mask."""
+    tree = None if scene.world is None else scene.world.node_tree
+    links = () if tree is None else tree.links
+    ends = (link for link in links if link.to_node.type == "OUTPUT_WORLD" and link.to_socket.name == "Volume")
+    return tuple((link, "is_muted", True) for link in ends)
 
 
 def _mask_changes(

@@ -540,6 +540,30 @@ def test_objects_behind_the_scene_are_not_in_the_mask(cube: Any, tmp_path: Path)
     assert floor.visible_camera
 
 
+def test_fog_is_not_in_the_mask(cube: Any, tmp_path: Path) -> None:
+    world = bpy.context.scene.world = bpy.data.worlds.new("foggy")
+    if world.node_tree is None:  # before Blender 5.0 a new world has no nodes
+        world.use_nodes = True
+    tree = world.node_tree
+    fog = tree.nodes.new("ShaderNodeVolumeScatter")
+    fog.inputs["Density"].default_value = 0.05
+    output = next(node for node in tree.nodes if node.type == "OUTPUT_WORLD")
+    link = tree.links.new(fog.outputs[0], output.inputs["Volume"])
+    generate(view_count=2, target="Cube")
+    assert_pictures_show_the_truth(rendered(tmp_path, target="Cube"))
+    assert not link.is_muted
+
+
+def test_workbench_does_not_see_through_the_subject(cube: Any, tmp_path: Path) -> None:
+    shading = bpy.context.scene.display.shading
+    shading.show_xray, shading.xray_alpha = True, 0.2
+    generate(view_count=2, target="Cube")
+    folder = rendered(tmp_path, target="Cube", engine="WORKBENCH")
+    assert_pictures_show_the_truth(folder)
+    assert pixels_rgba(folder / "images/000.png")[..., 3].max() > 0.99
+    assert shading.show_xray
+
+
 def test_pencils_are_hidden_from_every_engine(cube: Any, rendering: ModuleType) -> None:
     """Not rendered, as it needs a GPU or its software: no ray shows them, so none can be kept from them."""
     if bpy.app.version < (4, 3):
