@@ -19,7 +19,7 @@ from ..job_folder import (
     read_job,
     results_in,
 )
-from ..properties import settings_of
+from ..properties import IN_BLEND, settings_of
 from ..result_mesh import result_or_none
 from .on_result import RECONSTRUCT_FIRST, OnResult, Status, refused, result_of
 from .reconstruct import jobs_parent
@@ -31,7 +31,7 @@ class FEWVIEW_OT_export(OnResult, bpy.types.Operator):
     bl_idname = "fewview.export"
     bl_label = "Export Mesh"
 
-    filepath: StringProperty(name="File", subtype="FILE_PATH", options={"SKIP_SAVE"})
+    filepath: StringProperty(name="File", subtype="FILE_PATH", options={"SKIP_SAVE", *IN_BLEND})
     filter_glob: StringProperty(
         default=";".join(f"*{end}" for end in result_mesh.FORMATS), options={"HIDDEN"}
     )
@@ -92,7 +92,7 @@ class _OnFolder:
         name="Job",
         description="Folder of the job; that of the selected result, or of the newest, where this is empty",
         subtype="DIR_PATH",
-        options={"SKIP_SAVE"},
+        options={"SKIP_SAVE", *IN_BLEND},
     )
 
     def _job_folder(self, context: bpy.types.Context) -> Path:

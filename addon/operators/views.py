@@ -179,7 +179,13 @@ class FEWVIEW_OT_render_views(bpy.types.Operator):
         )
 
     def _start(self, scene: bpy.types.Scene, request: ViewRequest, folder: Path) -> None:
-        render_worker.prepare(scene, request, folder)
+        try:
+            render_worker.prepare(scene, request, folder)
+        except (RuntimeError, OSError) as error:
+            render_worker.clean(folder)
+            raise ValueError(
+                f"The scene cannot be copied to {folder}: is the disk full? ({error})"
+            ) from error
         scene_uid = scene.session_uid
         jobs.start(
             "Rendering views",

@@ -249,6 +249,17 @@ def test_pictures_have_names_that_any_disk_can_keep(result: Any, started: list[t
     assert names == [f"images/{name}.png" for name in ("Camera_001", "camera_001_2", "___up", "Büste")]
 
 
+def test_the_longest_names_of_blender_are_cut(result: Any, started: list[tuple[str, ...]]) -> None:
+    """With its ending a name of 255 bytes, as Blender has them from 5.0 on, is longer than a disk takes."""
+    points = world_points(result)
+    for _ in range(2):
+        camera("日" * 85, points, (1, 0, 0))
+    bpy.ops.fewview.render_novel_views()
+    names = [Path(frame["file_path"]).name for frame in frames(job_of(result) / "novel-views-001")]
+    assert len(set(names)) == 2
+    assert max(len(name.encode()) for name in names) <= 255
+
+
 def test_another_output_folder(result: Any, started: list[tuple[str, ...]], tmp_path: Path) -> None:
     camera("Camera", world_points(result), (1, 0, 0))
     bpy.ops.fewview.render_novel_views(output=str(tmp_path / "mine"), device="cpu")

@@ -154,7 +154,7 @@ def test_generating_around_nothing_says_why(addon: ModuleType) -> None:
     with pytest.raises(RuntimeError, match="Add an object"):
         bpy.ops.fewview.generate_views()
     bpy.ops.object.empty_add()
-    with pytest.raises(RuntimeError, match="no visible surface"):
+    with pytest.raises(RuntimeError, match="Empty: there is no visible surface; show it, or choose another"):
         bpy.ops.fewview.generate_views()
     with pytest.raises(RuntimeError, match="no object Moon"):
         bpy.ops.fewview.generate_views(target="Moon")
@@ -184,6 +184,39 @@ def test_rendered_views_are_exact_masked_and_taken_over(cube: Any, tmp_path: Pat
     assert (settings.source, settings.camera_source) == ("RENDER", "KNOWN")
     assert settings.cameras_path == str(folder / "transforms.json")
     assert settings.truth == str(folder / "truth.ply")
+
+
+def test_what_came_with_rendered_views_goes_with_them(cube: Any, tmp_path: Path) -> None:
+    """Else the photographs that come after them would be measured against the views' object."""
+    generate(view_count=2)
+    rendered(tmp_path / "jobs")
+    settings = bpy.context.scene.fewview
+    bpy.ops.fewview.clear_images()
+    assert (settings.camera_source, settings.cameras_path, settings.truth) == ("ESTIMATE", "", "")
+    rendered(tmp_path / "jobs")
+    settings.cameras_path = settings.truth = str(tmp_path / "own")
+    bpy.ops.fewview.clear_images()
+    assert (settings.camera_source, settings.cameras_path) == ("KNOWN", settings.truth)
+
+
+def test_where_nothing_can_be_written_says_what_to_do(cube: Any, tmp_path: Path) -> None:
+    generate(view_count=2)
+    (tmp_path / "file").touch()
+    with pytest.raises(RuntimeError, match=r"jobs cannot be written \(.*\): choose another output folder"):
+        bpy.ops.fewview.render_views(output=str(tmp_path / "file" / "jobs"))
+
+
+def test_beside_a_file_that_is_not_saved_is_nowhere(
+    part: Callable[[str], ModuleType], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A startup file may have such a setting; Blender would take the folder that it was started in."""
+    jobs_parent = part("operators.reconstruct").jobs_parent
+    monkeypatch.chdir(tmp_path)
+    unset = jobs_parent(bpy.context)
+    bpy.context.scene.fewview.output = "//jobs"
+    assert jobs_parent(bpy.context) == unset
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "own.blend"))
+    assert jobs_parent(bpy.context) == tmp_path / "jobs"
 
 
 def test_a_second_rendering_gets_a_folder_of_its_own(cube: Any, tmp_path: Path) -> None:
@@ -1054,6 +1087,16 @@ def test_an_error_in_the_second_blender_reaches_the_first(
         bpy.ops.fewview.render_views(output=str(tmp_path), **SMALL)
     assert not (tmp_path / "views-001/transforms.json").exists()
     assert not (tmp_path / "views-001" / second_blender.COPY).exists()
+
+
+def test_a_scene_that_cannot_be_copied_says_so(
+    cube: Any, second_blender: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    generate(view_count=2)
+    monkeypatch.setattr(second_blender, "COPY", "nowhere/scene.blend")
+    with pytest.raises(RuntimeError, match=r"cannot be copied to .*views-001: is the disk full\?"):
+        bpy.ops.fewview.render_views(output=str(tmp_path), **SMALL)
+    assert not list((tmp_path / "views-001").iterdir())
 
 
 def test_nothing_is_left_of_a_second_blender_that_does_not_start(
