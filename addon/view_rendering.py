@@ -14,6 +14,7 @@ from pathlib import Path
 
 import bpy
 import numpy as np
+from numpy.typing import NDArray
 
 from .camera_lens import pinhole_of, world_from_camera
 from .kept_settings import Change, changed
@@ -29,6 +30,8 @@ PENCILS = {"GREASEPENCIL", "GPENCIL"}
 """Type of the objects of Grease Pencil, from Blender 4.3 on and before."""
 PLACE = ("location", "rotation_euler", "rotation_quaternion", "rotation_axis_angle", "scale")
 """What moves an object; which rotation counts is a choice of the object."""
+
+_MUCH_WHITE = 0.1
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -265,14 +268,26 @@ def _take(scene: bpy.types.Scene, path: Path, *, noise_seed: int) -> SolvedCamer
     return SolvedCamera(name=f"{IMAGES}/{path.name}", world_from_camera=pose, pinhole=pinhole)
 
 
+def overexposed(path: Path) -> bool:
+    """Whether a good part of what a rendered view shows is white, where no texture is left to measure."""
+    rgba = _pixels_rgba(path)
+    shown = rgba[rgba[:, 3] == 1.0, :3]
+    return bool((shown == 1.0).all(axis=1).sum() > _MUCH_WHITE * len(shown))
+
+
 def _shows_something(path: Path) -> bool:
+    return bool(_pixels_rgba(path)[:, 3].any())
+
+
+def _pixels_rgba(path: Path) -> NDArray[np.float32]:
+    """(pixels, 4), as stored."""
     image = bpy.data.images.load(str(path))
     try:
         values = np.empty(len(image.pixels), np.float32)
         image.pixels.foreach_get(values)
     finally:
         bpy.data.images.remove(image)
-    return bool(values[3::4].any())
+    return values.reshape(-1, 4)
 
 
 def _subject(target: bpy.types.Object) -> tuple[bpy.types.Object, ...]:

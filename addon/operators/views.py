@@ -151,7 +151,8 @@ class FEWVIEW_OT_render_views(bpy.types.Operator):
             request = self._request(context)
             folder = new_folder(jobs_parent(context, self.output), "views")
             if render_worker.needs_waiting():
-                render_worker.render_here(request, folder)
+                for sentence in render_worker.render_here(request, folder):
+                    self.report({"WARNING"}, sentence)
                 for _ in take_views(context.scene.session_uid, folder):
                     pass
                 return {"FINISHED"}
@@ -166,7 +167,9 @@ class FEWVIEW_OT_render_views(bpy.types.Operator):
         views = _views(context, self.view_cameras, self.frame_step)
         if len(views) > MOST_VIEWS:
             raise ValueError(f"{len(views)} views are too many: take fewer frames")
-        target = _target(context, self)
+        target, chosen = _target(context, self), settings_of(context).target
+        if target is None and chosen is not None and not self.properties.is_property_set("target"):
+            raise ValueError(f"{chosen.name} is no longer in the scene: choose another object, or none")
         return ViewRequest(
             scene=context.scene.name_full,
             view_layer=context.view_layer.name,

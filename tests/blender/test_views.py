@@ -546,6 +546,30 @@ def test_an_object_that_is_in_no_picture_says_why(cube: Any, tmp_path: Path) -> 
     assert state() == before
 
 
+def test_an_object_that_was_deleted_says_so(cube: Any, tmp_path: Path) -> None:
+    """The field still shows it; without an object there would be no masks."""
+    generate(view_count=2)
+    bpy.context.scene.collection.objects.unlink(cube)
+    with pytest.raises(RuntimeError, match="Cube is no longer in the scene: choose another object, or none"):
+        rendered(tmp_path)
+    assert rendered(tmp_path, target="")
+
+
+@pytest.mark.parametrize("exposure", [0.0, -4.0])
+def test_too_much_light_is_told(
+    cube: Any, second_blender: ModuleType, part: Callable[[str], ModuleType], tmp_path: Path, exposure: float
+) -> None:
+    """Which AgX, as the viewport shows it, would have borne."""
+    bpy.data.objects["Sun"].data.energy = 20.0
+    bpy.context.scene.view_settings.view_transform = "AgX"
+    bpy.context.scene.view_settings.exposure = exposure
+    generate(view_count=2)
+    rendered(tmp_path)
+    told = part("jobs").ended().warnings
+    assert bool(told) == (exposure == 0.0)
+    assert all("white without texture in 2 of 2 views: lower the Exposure" in text for text in told)
+
+
 def test_a_linked_object_of_the_same_name_is_another_one(cube: Any, tmp_path: Path) -> None:
     bpy.data.libraries.write(str(tmp_path / "other.blend"), {cube}, fake_user=True)
     with bpy.data.libraries.load(str(tmp_path / "other.blend"), link=True) as (_, wanted):
