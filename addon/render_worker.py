@@ -31,7 +31,7 @@ from ..backend.wire.protocol import (
 from ..backend.wire.speaker import Speaker, speaker
 from .kept_settings import changed
 from .simulations import Kept, bake_folders, simulations
-from .view_rendering import ViewRequest, decode_request, encode_request, overexposed, render_views
+from .view_rendering import ViewRequest, decode_request, encode_request, is_ill_lit, render_views
 
 COPY, REQUEST, LOG = "scene.blend", "request.json", "render.log"
 STAGE = "render"
@@ -104,12 +104,12 @@ def render_here(request: ViewRequest, folder: Path) -> tuple[str, ...]:
 
     Raises as `render_views` does.
     """
-    burnt = 0
+    ill_lit = 0
     with closing(render_views(request, folder)) as views:
         for index, path in views:
             sys.stderr.write(f"FewView: {_view_of(index + 1, request)}\n")
-            burnt += overexposed(path)
-    return _of_light(burnt, request)
+            ill_lit += is_ill_lit(path)
+    return _of_light(ill_lit, request)
 
 
 def main(folder: str) -> None:
@@ -190,26 +190,28 @@ def _say_views(request: ViewRequest, folder: Path, asked: CancelRequest, speakin
     started_s, count = time.monotonic(), len(request.views)
     speaking.say(Progress(stage=STAGE, fraction=0.0, text=_view_of(1, request), remaining_s=None))
     files: list[str] = []
-    burnt = 0
+    ill_lit = 0
     with closing(render_views(request, folder)) as views:
         for index, path in views:
             asked.check()
             done = index + 1
-            burnt += overexposed(path)
+            ill_lit += is_ill_lit(path)
             files.append(path.relative_to(folder).as_posix())
             remaining_s = (time.monotonic() - started_s) / done * (count - done)
             text = _view_of(min(done + 1, count), request)
             speaking.say(Progress(stage=STAGE, fraction=done / count, text=text, remaining_s=remaining_s))
-    for sentence in _of_light(burnt, request):
+    for sentence in _of_light(ill_lit, request):
         speaking.say(Warned(text=sentence))
     return Finished(output=str(folder), files=(*files, "transforms.json"))
 
 
-def _of_light(burnt: int, request: ViewRequest) -> tuple[str, ...]:
-    """What to say of so many views that are overexposed."""
-    views = f"{burnt} of {len(request.views)} views"
-    remedy = "lower the Exposure in the scene's Color Management, or its lights, and render again"
-    return (f"Too much light leaves white without texture in {views}: {remedy}",) if burnt else ()
+def _of_light(ill_lit: int, request: ViewRequest) -> tuple[str, ...]:
+    """What to say of so many views that are white or black."""
+    if not ill_lit:
+        return ()
+    views = f"{ill_lit} of {len(request.views)} views"
+    remedy = "change the lights, or Exposure in the scene's Color Management, and render again"
+    return (f"Too much light, or too little, leaves white or black without texture in {views}: {remedy}",)
 
 
 def _view_of(number: int, request: ViewRequest) -> str:

@@ -31,7 +31,7 @@ PENCILS = {"GREASEPENCIL", "GPENCIL"}
 PLACE = ("location", "rotation_euler", "rotation_quaternion", "rotation_axis_angle", "scale")
 """What moves an object; which rotation counts is a choice of the object."""
 
-_MUCH_WHITE = 0.1
+_MUCH_PLAIN = 0.2
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -158,6 +158,7 @@ def render_changes(scene: bpy.types.Scene, request: ViewRequest) -> tuple[Change
         (view, "use_curve_mapping", False),
         (scene.display.shading, "show_xray", False),  # Workbench's: the mask would be half transparent
         *((cycles, name, value) for name, value in of_cycles.items() if cycles is not None),
+        (scene.view_layers[request.view_layer], "samples", 0),  # they would count before the scene's
         (scene, "camera", scene.camera),
     )
 
@@ -268,11 +269,12 @@ def _take(scene: bpy.types.Scene, path: Path, *, noise_seed: int) -> SolvedCamer
     return SolvedCamera(name=f"{IMAGES}/{path.name}", world_from_camera=pose, pinhole=pinhole)
 
 
-def overexposed(path: Path) -> bool:
-    """Whether a good part of what a rendered view shows is white, where no texture is left to measure."""
+def is_ill_lit(path: Path) -> bool:
+    """Whether a good part of what a rendered view shows is white or black, and so without texture."""
     rgba = _pixels_rgba(path)
     shown = rgba[rgba[:, 3] == 1.0, :3]
-    return bool((shown == 1.0).all(axis=1).sum() > _MUCH_WHITE * len(shown))
+    plain = (shown == 1.0).all(axis=1) | (shown == 0.0).all(axis=1)
+    return bool(plain.sum() > _MUCH_PLAIN * len(shown))
 
 
 def _shows_something(path: Path) -> bool:

@@ -555,19 +555,30 @@ def test_an_object_that_was_deleted_says_so(cube: Any, tmp_path: Path) -> None:
     assert rendered(tmp_path, target="")
 
 
-@pytest.mark.parametrize("exposure", [0.0, -4.0])
-def test_too_much_light_is_told(
-    cube: Any, second_blender: ModuleType, part: Callable[[str], ModuleType], tmp_path: Path, exposure: float
+@pytest.mark.parametrize(("energy", "is_told"), [(0.0, True), (2.0, False), (20.0, True)])
+def test_too_much_light_and_none_are_told(
+    cube: Any,
+    second_blender: ModuleType,
+    part: Callable[[str], ModuleType],
+    tmp_path: Path,
+    energy: float,
+    is_told: bool,
 ) -> None:
-    """Which AgX, as the viewport shows it, would have borne."""
-    bpy.data.objects["Sun"].data.energy = 20.0
+    """Of which AgX, in the viewport, shows the one and Solid mode the other."""
+    bpy.data.objects["Sun"].data.energy = energy
+    bpy.context.scene.world = bpy.data.worlds.new("grey") if energy else None
     bpy.context.scene.view_settings.view_transform = "AgX"
-    bpy.context.scene.view_settings.exposure = exposure
     generate(view_count=2)
     rendered(tmp_path)
     told = part("jobs").ended().warnings
-    assert bool(told) == (exposure == 0.0)
-    assert all("white without texture in 2 of 2 views: lower the Exposure" in text for text in told)
+    assert bool(told) == is_told
+    assert all("white or black without texture in 2 of 2 views: change the lights" in text for text in told)
+
+
+def test_samples_are_those_that_are_asked_for(cube: Any, rendering: ModuleType) -> None:
+    layer = bpy.context.view_layer
+    layer.samples = 4096  # which count before the scene's
+    assert (layer, "samples", 0) in rendering.render_changes(bpy.context.scene, request(rendering))
 
 
 def test_a_linked_object_of_the_same_name_is_another_one(cube: Any, tmp_path: Path) -> None:
