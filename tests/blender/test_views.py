@@ -1111,7 +1111,7 @@ def test_what_a_second_blender_lacks_is_said(
     (painted,) = second_blender.not_copied(scene, first)
     generate(view_count=2)
     rendered(tmp_path)
-    assert part("jobs").ended().warnings == (painted,)  # where the panel shows it
+    assert painted in part("jobs").ended().warnings  # where the panel shows it
 
 
 def test_an_error_in_the_second_blender_reaches_the_first(
