@@ -30,7 +30,7 @@ from ..backend.wire.protocol import (
 )
 from ..backend.wire.speaker import Speaker, speaker
 from .kept_settings import changed
-from .simulations import Kept, bake_folders, simulations
+from .simulations import bake_folders, frames_to_play, is_in_file_alone, leave_disk
 from .view_rendering import ViewRequest, decode_request, encode_request, is_ill_lit, render_views
 
 COPY, REQUEST, LOG = "scene.blend", "request.json", "render.log"
@@ -55,29 +55,18 @@ def prepare(scene: bpy.types.Scene, request: ViewRequest, folder: Path) -> None:
     if bpy.ops.ed.flush_edits.poll():
         bpy.ops.ed.flush_edits()  # what is being edited or sculpted
     copy = str(folder / COPY)
-    folders = bake_folders(scene)
-    if folders or any(
-        made.kept is not Kept.IN_MEMORY for made in simulations(scene, _last_frame(scene, request))
-    ):
-        with changed(folders):
+    if is_in_file_alone(scene, _last_frame(scene, request)):
+        with changed(bake_folders(scene)):
             bpy.ops.wm.save_as_mainfile(filepath=copy, copy=True, compress=False, check_existing=False)
         return
     blocks = {scene, *bpy.data.texts}  # drivers may call what a text defines
     bpy.data.libraries.write(copy, blocks, path_remap="ABSOLUTE", compress=False)
 
 
-def not_copied(scene: bpy.types.Scene, request: ViewRequest) -> tuple[str, ...]:
-    """What the second Blender has not, or not as it is here, in sentences for the user."""
-    begun = simulations(scene, _last_frame(scene, request))
-    sentences = {
-        "Rendered as they were last saved or packed": [
-            image.name for image in bpy.data.images if image.is_dirty
-        ],
-        "Rendered without what is simulated in a cache on disk": [
-            made.name for made in begun if made.kept is Kept.ON_DISK
-        ],
-    }
-    return tuple(f"{what}: {', '.join(dict.fromkeys(names))}" for what, names in sentences.items() if names)
+def not_copied() -> tuple[str, ...]:
+    """What the second Blender has not as it is here, in sentences for the user."""
+    painted = [image.name for image in bpy.data.images if image.is_dirty]
+    return (f"Rendered as they were last saved or packed: {', '.join(painted)}",) if painted else ()
 
 
 def _last_frame(scene: bpy.types.Scene, request: ViewRequest) -> int:
@@ -177,8 +166,9 @@ def _take_over(folder: Path) -> ViewRequest:
 def _play(scene: bpy.types.Scene, request: ViewRequest, asked: CancelRequest, speaking: Speaker) -> None:
     """Simulate what the copy does not hold, frame by frame, up to the last that is rendered."""
     shown, last = scene.frame_current, _last_frame(scene, request)
-    firsts = [made.first_frame for made in simulations(scene, last) if made.kept is Kept.IN_MEMORY]
-    for frame in range(min(firsts, default=last + 1), last + 1):
+    frames = frames_to_play(scene, last)
+    leave_disk(scene)
+    for frame in frames:
         asked.check()
         text = f"simulating frame {frame} of {last}"
         speaking.say(Progress(stage=STAGE, fraction=0.0, text=text, remaining_s=None))

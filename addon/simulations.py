@@ -1,13 +1,13 @@
-"""What is simulated in a scene, and where its frames are: what a copy of the file has of them, and what not.
+"""What is simulated in a scene, and what a copy of the file needs to have it too.
 
-A file that is saved holds the point caches of its own objects. What rigid bodies, linked and overridden
-objects and simulation zones do is in Blender's memory alone unless it is baked: a copy has it when it has
-played the frames. A cache on disk belongs to the name of the file.
+A file that is saved holds the point caches of its own objects that are in memory. A cache on disk belongs to
+the name of the file, and what linked and overridden objects, simulation zones, and rigid bodies that are not
+baked do is in Blender's memory alone: a copy has it when it has played the frames.
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
-from enum import Enum, auto
+from contextlib import suppress
+from pathlib import Path
 from typing import Any
 
 import bpy
@@ -15,33 +15,16 @@ import bpy
 from .kept_settings import Change
 
 
-class Kept(Enum):
-    """Where the frames of a simulation are."""
-
-    IN_FILE = auto()
-    ON_DISK = auto()
-    IN_MEMORY = auto()
+def is_in_file_alone(scene: bpy.types.Scene, last_frame: int) -> bool:
+    """Whether the context's scene must be saved to have what was simulated or baked before this frame."""
+    begun = any(first < last_frame and is_in_file for first, is_in_file in _simulations(scene))
+    return begun or bool(bake_folders(scene))
 
 
-@dataclass(frozen=True, kw_only=True)
-class Simulation:
-    """Something whose frames follow from those before."""
-
-    name: str
-    """Of the object, or the scene."""
-    kept: Kept
-    first_frame: int
-
-
-def simulations(scene: bpy.types.Scene, last_frame: int) -> list[Simulation]:
-    """Those of the context's scene that have begun before this frame, also in what is only instanced.
-
-    Without those of linked objects whose own file, or a cache beside it, has them.
-    """
-    found = [*_of_rigid_bodies(scene)]
-    for made in _objects(scene):
-        found += [*_of_point_caches(made), *_of_zones(scene, made)]
-    return [simulation for simulation in found if simulation.first_frame < last_frame]
+def frames_to_play(scene: bpy.types.Scene, last_frame: int) -> range:
+    """The frames, in order, of what the file of the context's scene does not hold; none if it holds all."""
+    firsts = (first for first, is_in_file in _simulations(scene) if first < last_frame and not is_in_file)
+    return range(min(firsts, default=last_frame + 1), last_frame + 1)
 
 
 def bake_folders(scene: bpy.types.Scene) -> list[Change]:
@@ -56,45 +39,53 @@ def bake_folders(scene: bpy.types.Scene) -> list[Change]:
     return [(owner, name, bpy.path.abspath(path)) for owner, name in owners if (path := getattr(owner, name))]
 
 
+def leave_disk(scene: bpy.types.Scene) -> None:
+    """Have the caches on disk of the context's scene in memory, without a frame: their files are missing."""
+    for owner, cache in _point_caches(scene):
+        if owner.library is None and cache.use_disk_cache:
+            cache.use_disk_cache = False
+            if cache.is_baked:
+                with bpy.context.temp_override(point_cache=cache):
+                    bpy.ops.ptcache.free_bake()
+    file = Path(bpy.data.filepath)
+    with suppress(OSError):  # where Blender has looked for frames; there are none
+        file.with_name(f"blendcache_{file.stem}").rmdir()
+
+
+def _simulations(scene: bpy.types.Scene) -> Iterator[tuple[int, bool]]:
+    """First frame of each, and whether a file that is saved holds it.
+
+    Without those of linked objects whose own file, or a cache beside it, has them. Whether a zone is baked
+    cannot be asked for; then its frames are read when they are played.
+    """
+    for owner, cache in _point_caches(scene):
+        if owner.library is None or not (cache.is_baked or cache.use_disk_cache):
+            is_own = owner.library is None and owner.override_library is None
+            is_kept = cache.is_baked if owner == scene else is_own
+            yield cache.frame_start, is_kept and not cache.use_disk_cache
+    for modifier in (modifier for made in _objects(scene) for modifier in made.modifiers):
+        for bake in modifier.bakes if modifier.type == "NODES" else ():
+            if bake.node is not None and bake.node.type == "SIMULATION_OUTPUT":
+                yield bake.frame_start if bake.use_custom_simulation_frame_range else scene.frame_start, False
+
+
+def _point_caches(scene: bpy.types.Scene) -> Iterator[tuple[bpy.types.ID, bpy.types.PointCache]]:
+    """With the object each belongs to, or the scene."""
+    if scene.rigidbody_world is not None and scene.rigidbody_world.point_cache is not None:
+        yield scene, scene.rigidbody_world.point_cache
+    for made in _objects(scene):
+        for modifier in made.modifiers:
+            if hasattr(modifier, "point_cache"):  # cloth and soft bodies
+                yield made, modifier.point_cache
+            canvas = getattr(modifier, "canvas_settings", None)
+            for surface in () if canvas is None else canvas.canvas_surfaces:
+                yield made, surface.point_cache
+        for system in made.particle_systems:
+            if system.settings.type != "HAIR" or system.use_hair_dynamics:
+                yield made, system.point_cache
+
+
 def _objects(scene: bpy.types.Scene) -> set[bpy.types.Object]:
     """The scene's, and all that they are computed from: what collections and nodes show need not be in it."""
     used = (block.original for block in bpy.context.evaluated_depsgraph_get().ids)
     return {*scene.objects, *(block for block in used if isinstance(block, bpy.types.Object))}
-
-
-def _of_rigid_bodies(scene: bpy.types.Scene) -> Iterator[Simulation]:
-    world = scene.rigidbody_world
-    cache = None if world is None else world.point_cache
-    if cache is not None and (cache.use_disk_cache or not cache.is_baked):
-        kept = Kept.ON_DISK if cache.use_disk_cache else Kept.IN_MEMORY
-        yield Simulation(name=scene.name, kept=kept, first_frame=cache.frame_start)
-
-
-def _of_point_caches(made: bpy.types.Object) -> Iterator[Simulation]:
-    for modifier in made.modifiers:
-        if hasattr(modifier, "point_cache"):  # cloth and soft bodies
-            yield from _of_point_cache(made, modifier.point_cache)
-        canvas = getattr(modifier, "canvas_settings", None)
-        for surface in () if canvas is None else canvas.canvas_surfaces:
-            yield from _of_point_cache(made, surface.point_cache)
-    for system in made.particle_systems:
-        if system.settings.type != "HAIR" or system.use_hair_dynamics:
-            yield from _of_point_cache(made, system.point_cache)
-
-
-def _of_point_cache(owner: bpy.types.ID, cache: bpy.types.PointCache) -> Iterator[Simulation]:
-    if owner.library is not None and (cache.is_baked or cache.use_disk_cache):
-        return
-    kept = Kept.IN_FILE if owner.library is None and owner.override_library is None else Kept.IN_MEMORY
-    if cache.use_disk_cache:
-        kept = Kept.ON_DISK
-    yield Simulation(name=owner.name, kept=kept, first_frame=cache.frame_start)
-
-
-def _of_zones(scene: bpy.types.Scene, made: bpy.types.Object) -> Iterator[Simulation]:
-    """Whether one is baked cannot be asked for; then its frames are read when they are played."""
-    for modifier in made.modifiers:
-        for bake in modifier.bakes if modifier.type == "NODES" else ():
-            if bake.node is not None and bake.node.type == "SIMULATION_OUTPUT":
-                first = bake.frame_start if bake.use_custom_simulation_frame_range else scene.frame_start
-                yield Simulation(name=made.name, kept=Kept.IN_MEMORY, first_frame=first)

@@ -203,7 +203,7 @@ class FEWVIEW_OT_render_views(bpy.types.Operator):
         )
         running = jobs.running()
         if running is not None:
-            running.warnings += render_worker.not_copied(scene, request)
+            running.warnings += render_worker.not_copied()
 
 
 def take_views(scene_uid: int, folder: Path) -> Iterator[None]:
