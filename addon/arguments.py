@@ -20,7 +20,8 @@ def argument(setting: str) -> Any:
     It is not remembered from one call to the next: what is left out is the scene's, not the last call's.
     """
     deferred = FEWVIEW_PG_settings.__annotations__[setting]
-    return deferred.function(**{**deferred.keywords, "options": {"SKIP_SAVE"}})
+    options = deferred.keywords.get("options", ())
+    return deferred.function(**{**deferred.keywords, "options": {"SKIP_SAVE", *options}})
 
 
 def fill_in(

@@ -93,7 +93,8 @@ def new_folder(parent: Path, kind: str) -> Path:
                 continue
             return folder
     except OSError as error:
-        raise FolderError(f"{parent} cannot be written ({error.strerror or error})") from error
+        reason = error.strerror or error
+        raise FolderError(f"{parent} cannot be written ({reason}): choose another output folder") from error
 
 
 def folder_for(parent: Path, job: Job) -> Path:

@@ -16,11 +16,14 @@ from bpy.props import (
 
 from ..backend.point_methods import PointMethod
 
+IN_BLEND = {"PATH_SUPPORTS_BLEND_RELATIVE"} if bpy.app.version >= (4, 5) else set()
+"""Options of a path in which // is the folder of the .blend; Blender before 4.5 allows it in every one."""
+
 
 class FEWVIEW_PG_image(bpy.types.PropertyGroup):
     """One photograph of the list"""
 
-    path: StringProperty(name="File", subtype="FILE_PATH")
+    path: StringProperty(name="File", subtype="FILE_PATH", options=IN_BLEND)
     use: BoolProperty(name="Use", description="Reconstruct from this photograph", default=True)
     width: IntProperty(name="Width", description="In pixels; 0 where it is not known")
     height: IntProperty(name="Height", description="In pixels; 0 where it is not known")
@@ -44,6 +47,7 @@ class FEWVIEW_PG_settings(bpy.types.PropertyGroup):
         name="Masks",
         description="Folder with an image per photograph, white on the subject; may be empty",
         subtype="DIR_PATH",
+        options=IN_BLEND,
     )
 
     # 1b. Render from scene
@@ -153,9 +157,13 @@ class FEWVIEW_PG_settings(bpy.types.PropertyGroup):
         name="File or Folder",
         description="A transforms.json, or the folder of a COLMAP model",
         subtype="FILE_PATH",
+        options=IN_BLEND,
     )
     cameras_job: StringProperty(
-        name="Cameras Job", description="Folder with the cameras found in step 2", subtype="DIR_PATH"
+        name="Cameras Job",
+        description="Folder with the cameras found in step 2",
+        subtype="DIR_PATH",
+        options=IN_BLEND,
     )
     root: PointerProperty(
         name="Placement",
@@ -201,9 +209,13 @@ class FEWVIEW_PG_settings(bpy.types.PropertyGroup):
         name="Output",
         description="Folder for jobs; beside the .blend, or the one of the preferences, where this is empty",
         subtype="DIR_PATH",
+        options=IN_BLEND,
     )
     truth: StringProperty(
-        name="Truth", description="Mesh file that the result is measured against", subtype="FILE_PATH"
+        name="Truth",
+        description="Mesh file that the result is measured against",
+        subtype="FILE_PATH",
+        options=IN_BLEND,
     )
 
     # Points alone

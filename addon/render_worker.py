@@ -8,7 +8,7 @@ import platform
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
 
@@ -29,7 +29,9 @@ from ..backend.wire.protocol import (
     Warned,
 )
 from ..backend.wire.speaker import Speaker, speaker
-from .view_rendering import ViewRequest, decode_request, encode_request, render_views
+from .kept_settings import changed
+from .simulations import bake_folders, frames_to_play, is_in_file_alone, leave_disk
+from .view_rendering import ViewRequest, decode_request, encode_request, is_ill_lit, render_views
 
 COPY, REQUEST, LOG = "scene.blend", "request.json", "render.log"
 STAGE = "render"
@@ -46,48 +48,29 @@ def prepare(scene: bpy.types.Scene, request: ViewRequest, folder: Path) -> None:
     """Write what the second Blender reads: the request, and the scene with all that it uses.
 
     Not by saving a copy of the file, which takes longer and runs the user's handlers; but where there are
-    simulations, whose frames are in nothing else.
+    simulations or bakes, which are in nothing else.
     Raises RuntimeError or OSError where the copy cannot be written.
     """
     (folder / REQUEST).write_text(encode_request(request), encoding="utf-8")
     if bpy.ops.ed.flush_edits.poll():
         bpy.ops.ed.flush_edits()  # what is being edited or sculpted
     copy = str(folder / COPY)
-    if any(_simulations(scene, request)):
-        bpy.ops.wm.save_as_mainfile(filepath=copy, copy=True, compress=False, check_existing=False)
+    if is_in_file_alone(scene, _last_frame(scene, request)):
+        with changed(bake_folders(scene)):
+            bpy.ops.wm.save_as_mainfile(filepath=copy, copy=True, compress=False, check_existing=False)
         return
     blocks = {scene, *bpy.data.texts}  # drivers may call what a text defines
     bpy.data.libraries.write(copy, blocks, path_remap="ABSOLUTE", compress=False)
 
 
-def not_copied(scene: bpy.types.Scene, request: ViewRequest) -> tuple[str, ...]:
-    """What the second Blender has not, or not as it is here, in sentences for the user."""
+def not_copied() -> tuple[str, ...]:
+    """What the second Blender has not as it is here, in sentences for the user."""
     painted = [image.name for image in bpy.data.images if image.is_dirty]
-    on_disk = [name for name, cache in _simulations(scene, request) if cache.use_disk_cache]
-    sentences = {
-        "Rendered as they were last saved or packed": painted,
-        "Rendered without what is simulated in a cache on disk": on_disk,
-    }
-    return tuple(f"{what}: {', '.join(dict.fromkeys(names))}" for what, names in sentences.items() if names)
+    return (f"Rendered as they were last saved or packed: {', '.join(painted)}",) if painted else ()
 
 
-def _simulations(scene: bpy.types.Scene, request: ViewRequest) -> Iterator[tuple[str, bpy.types.PointCache]]:
-    """Names of objects, and what was simulated of them before the frames of the views."""
-    last = max(scene.frame_current if view.frame is None else view.frame for view in request.views)
-    for made in scene.objects:
-        yield from ((made.name, cache) for cache in _point_caches(made) if cache.frame_start < last)
-
-
-def _point_caches(made: bpy.types.Object) -> Iterator[bpy.types.PointCache]:
-    for modifier in made.modifiers:
-        if hasattr(modifier, "point_cache"):  # cloth and soft bodies
-            yield modifier.point_cache
-        canvas = getattr(modifier, "canvas_settings", None)
-        if canvas is not None:
-            yield from (surface.point_cache for surface in canvas.canvas_surfaces)
-    for system in made.particle_systems:
-        if system.settings.type != "HAIR" or system.use_hair_dynamics:
-            yield system.point_cache
+def _last_frame(scene: bpy.types.Scene, request: ViewRequest) -> int:
+    return max(scene.frame_current if view.frame is None else view.frame for view in request.views)
 
 
 def clean(folder: Path) -> None:
@@ -105,11 +88,17 @@ def worker_command(folder: Path) -> tuple[str, ...]:
     )
 
 
-def render_here(request: ViewRequest, folder: Path) -> None:
-    """Render in this Blender, with progress on stderr. Raises as `render_views` does."""
+def render_here(request: ViewRequest, folder: Path) -> tuple[str, ...]:
+    """Render in this Blender, with progress on stderr; what the user should know of the pictures.
+
+    Raises as `render_views` does.
+    """
+    ill_lit = 0
     with closing(render_views(request, folder)) as views:
-        for index, _ in views:
+        for index, path in views:
             sys.stderr.write(f"FewView: {_view_of(index + 1, request)}\n")
+            ill_lit += is_ill_lit(path)
+    return _of_light(ill_lit, request)
 
 
 def main(folder: str) -> None:
@@ -151,6 +140,7 @@ def _render(folder: Path, asked: CancelRequest, speaking: Speaker) -> Message:
         if bpy.app.autoexec_fail:
             text = "Python in this file was not run for the views, as Auto Run Python Scripts is off"
             speaking.say(Warned(text=text))
+        _play(bpy.context.scene, request, asked, speaking)
         return _say_views(request, folder, asked, speaking)
     except Cancelled:
         return _cancelled()
@@ -173,19 +163,45 @@ def _take_over(folder: Path) -> ViewRequest:
     return request
 
 
+def _play(scene: bpy.types.Scene, request: ViewRequest, asked: CancelRequest, speaking: Speaker) -> None:
+    """Simulate what the copy does not hold, frame by frame, up to the last that is rendered."""
+    shown, last = scene.frame_current, _last_frame(scene, request)
+    frames = frames_to_play(scene, last)
+    leave_disk(scene)
+    for frame in frames:
+        asked.check()
+        text = f"simulating frame {frame} of {last}"
+        speaking.say(Progress(stage=STAGE, fraction=0.0, text=text, remaining_s=None))
+        scene.frame_set(frame)
+    scene.frame_set(shown)
+
+
 def _say_views(request: ViewRequest, folder: Path, asked: CancelRequest, speaking: Speaker) -> Message:
     started_s, count = time.monotonic(), len(request.views)
     speaking.say(Progress(stage=STAGE, fraction=0.0, text=_view_of(1, request), remaining_s=None))
     files: list[str] = []
+    ill_lit = 0
     with closing(render_views(request, folder)) as views:
         for index, path in views:
             asked.check()
             done = index + 1
+            ill_lit += is_ill_lit(path)
             files.append(path.relative_to(folder).as_posix())
             remaining_s = (time.monotonic() - started_s) / done * (count - done)
             text = _view_of(min(done + 1, count), request)
             speaking.say(Progress(stage=STAGE, fraction=done / count, text=text, remaining_s=remaining_s))
+    for sentence in _of_light(ill_lit, request):
+        speaking.say(Warned(text=sentence))
     return Finished(output=str(folder), files=(*files, "transforms.json"))
+
+
+def _of_light(ill_lit: int, request: ViewRequest) -> tuple[str, ...]:
+    """What to say of so many views that are white or black."""
+    if not ill_lit:
+        return ()
+    views = f"{ill_lit} of {len(request.views)} views"
+    remedy = "change the lights, or Exposure in the scene's Color Management, and render again"
+    return (f"Too much light, or too little, leaves white or black without texture in {views}: {remedy}",)
 
 
 def _view_of(number: int, request: ViewRequest) -> str:

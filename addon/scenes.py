@@ -28,6 +28,14 @@ def in_scene(scene: bpy.types.Scene, made: bpy.types.Object | None) -> bpy.types
     return next((other for other in scene.objects if other == made), None)
 
 
-def object_named(scene: bpy.types.Scene, name: str) -> bpy.types.Object | None:
+def object_or_none(scene: bpy.types.Scene, name: str) -> bpy.types.Object | None:
     """The object of this full name, or else name: of several with one name that of no other file."""
     return next((made for made in scene.objects if made.name_full == name), scene.objects.get(name))
+
+
+def object_named(scene: bpy.types.Scene, name: str) -> bpy.types.Object:
+    """As `object_or_none`. Raises ValueError where there is none."""
+    found = object_or_none(scene, name)
+    if found is None:
+        raise ValueError(f"There is no object {name} in the scene")
+    return found

@@ -38,7 +38,10 @@ def generate(scene: bpy.types.Scene, target: bpy.types.Object, plan: ViewPlan) -
 
     Raises ValueError where the object has no visible surface.
     """
-    points = true_mesh(subject_of(target)).vertices
+    try:
+        points = true_mesh(subject_of(target)).vertices
+    except ValueError as error:
+        raise ValueError(f"{target.name}: {error}; show it, or choose another object") from error
     aspect = scene.render.pixel_aspect_y / scene.render.pixel_aspect_x
     focal_px = plan.lens_mm / SENSOR_WIDTH_MM * max(plan.width, plan.height * aspect)
     # Framing knows square pixels only: high ones are as if there were more rows.

@@ -14,10 +14,12 @@ from pathlib import Path
 
 import bpy
 import numpy as np
+from numpy.typing import NDArray
 
 from .camera_lens import pinhole_of, world_from_camera
 from .kept_settings import Change, changed
 from .png import critical_chunks
+from .scenes import object_named
 from .solved import SolvedCamera, write_cameras
 from .true_mesh import TrueMesh, as_rendered, instanced_by, rendered_objects, subject_of, true_mesh, write_ply
 
@@ -28,6 +30,8 @@ PENCILS = {"GREASEPENCIL", "GPENCIL"}
 """Type of the objects of Grease Pencil, from Blender 4.3 on and before."""
 PLACE = ("location", "rotation_euler", "rotation_quaternion", "rotation_axis_angle", "scale")
 """What moves an object; which rotation counts is a choice of the object."""
+
+_MUCH_PLAIN = 0.2
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,14 +85,15 @@ def render_views(request: ViewRequest, folder: Path) -> Generator[tuple[int, Pat
         raise ValueError(f"{request.scene}, {request.view_layer} is not what Blender shows")
     if not request.views:
         raise ValueError("there are no cameras to render from")
-    subject = () if request.target is None else _subject(_object(scene, request.target))
-    cameras = [_object(scene, view.camera) for view in request.views if view.camera]
+    subject = () if request.target is None else _subject(object_named(scene, request.target))
+    cameras = [object_named(scene, view.camera) for view in request.views if view.camera]
     (folder / IMAGES).mkdir(parents=True)
     taken: list[SolvedCamera] = []
     is_seen = False
     changes = (
         *_marker_changes(scene, request),
         *render_changes(scene, request),
+        *(_fog_changes(scene) if subject else ()),
         *camera_changes(scene, cameras),
     )
     with _same_frame(scene), changed(changes):
@@ -151,7 +156,9 @@ def render_changes(scene: bpy.types.Scene, request: ViewRequest) -> tuple[Change
         (view, "look", "None"),
         (view, "gamma", 1.0),
         (view, "use_curve_mapping", False),
+        (scene.display.shading, "show_xray", False),  # Workbench's: the mask would be half transparent
         *((cycles, name, value) for name, value in of_cycles.items() if cycles is not None),
+        (scene.view_layers[request.view_layer], "samples", 0),  # they would count before the scene's
         (scene, "camera", scene.camera),
     )
 
@@ -168,6 +175,14 @@ def _marker_changes(scene: bpy.types.Scene, request: ViewRequest) -> tuple[Chang
     if not all(view.camera for view in request.views):
         return ()
     return tuple((marker, "camera", None) for marker in scene.timeline_markers if marker.camera)
+
+
+def _fog_changes(scene: bpy.types.Scene) -> tuple[Change, ...]:
+    """Without the world's volume: it lies before everything, and so all of a picture would be in the mask."""
+    tree = None if scene.world is None else scene.world.node_tree
+    links = () if tree is None else tree.links
+    ends = (link for link in links if link.to_node.type == "OUTPUT_WORLD" and link.to_socket.name == "Volume")
+    return tuple((link, "is_muted", True) for link in ends)
 
 
 def _mask_changes(
@@ -232,7 +247,7 @@ def _go_to(scene: bpy.types.Scene, view: View) -> None:
     else:
         scene.frame_set(view.frame)  # a marker may change the scene's camera here
     if view.camera:
-        scene.camera = _object(scene, view.camera)
+        scene.camera = object_named(scene, view.camera)
     if scene.camera is None:
         raise ValueError("the scene has no camera: add one, or render from other cameras")
     bpy.context.view_layer.update()
@@ -254,21 +269,27 @@ def _take(scene: bpy.types.Scene, path: Path, *, noise_seed: int) -> SolvedCamer
     return SolvedCamera(name=f"{IMAGES}/{path.name}", world_from_camera=pose, pinhole=pinhole)
 
 
+def is_ill_lit(path: Path) -> bool:
+    """Whether a good part of what a rendered view shows is white or black, and so without texture."""
+    rgba = _pixels_rgba(path)
+    shown = rgba[rgba[:, 3] == 1.0, :3]
+    plain = (shown == 1.0).all(axis=1) | (shown == 0.0).all(axis=1)
+    return bool(plain.sum() > _MUCH_PLAIN * len(shown))
+
+
 def _shows_something(path: Path) -> bool:
+    return bool(_pixels_rgba(path)[:, 3].any())
+
+
+def _pixels_rgba(path: Path) -> NDArray[np.float32]:
+    """(pixels, 4), as stored."""
     image = bpy.data.images.load(str(path))
     try:
         values = np.empty(len(image.pixels), np.float32)
         image.pixels.foreach_get(values)
     finally:
         bpy.data.images.remove(image)
-    return bool(values[3::4].any())
-
-
-def _object(scene: bpy.types.Scene, full_name: str) -> bpy.types.Object:
-    found = next((made for made in scene.objects if made.name_full == full_name), None)
-    if found is None:
-        raise ValueError(f"there is no object {full_name} in the scene")
-    return found
+    return values.reshape(-1, 4)
 
 
 def _subject(target: bpy.types.Object) -> tuple[bpy.types.Object, ...]:

@@ -13,7 +13,7 @@ from ...backend.wire.protocol import PROTOCOL_VERSION, Job
 from .. import camera_objects, jobs, undo_step
 from ..arguments import absolute, argument, fill_in
 from ..job_folder import LOG, RESULT, FolderError, folder_for, read_job_file, write_job
-from ..properties import settings_of
+from ..properties import IN_BLEND, settings_of
 from ..scenes import scene_name_of, scene_named
 from .environment import backend_python_or_reason
 from .images import used_images
@@ -30,7 +30,7 @@ class FEWVIEW_OT_estimate_cameras(bpy.types.Operator):
         name="Photographs",
         description="Folder of photographs; those of the list where this is empty",
         subtype="DIR_PATH",
-        options={"SKIP_SAVE"},
+        options={"SKIP_SAVE", *IN_BLEND},
     )
     camera_source: argument("camera_source")
     cameras_path: argument("cameras_path")
@@ -108,7 +108,7 @@ class FEWVIEW_OT_import_cameras(bpy.types.Operator):
         name="Job Folder",
         description="Folder of the job; that of the last cameras where this is empty",
         subtype="DIR_PATH",
-        options={"SKIP_SAVE"},
+        options={"SKIP_SAVE", *IN_BLEND},
     )
 
     def execute(self, context: bpy.types.Context) -> set[str]:

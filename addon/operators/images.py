@@ -11,7 +11,7 @@ from bpy.props import CollectionProperty, StringProperty
 
 from ...backend.wire.photographs import SUFFIXES, passed_over, passed_over_text, photographs_in
 from ..image_header import size_or_none
-from ..properties import FEWVIEW_PG_settings, settings_of
+from ..properties import IN_BLEND, FEWVIEW_PG_settings, settings_of
 
 MOST_IMAGES = 1000
 _SMALL_PX = 640
@@ -72,8 +72,8 @@ class FEWVIEW_OT_add_images(bpy.types.Operator):
     bl_label = "Add Photographs"
     bl_options = {"REGISTER", "UNDO"}
 
-    filepath: StringProperty(subtype="FILE_PATH", options={"SKIP_SAVE"})
-    directory: StringProperty(subtype="DIR_PATH", options={"SKIP_SAVE"})
+    filepath: StringProperty(subtype="FILE_PATH", options={"SKIP_SAVE", *IN_BLEND})
+    directory: StringProperty(subtype="DIR_PATH", options={"SKIP_SAVE", *IN_BLEND})
     files: CollectionProperty(type=bpy.types.OperatorFileListElement, options={"SKIP_SAVE", "HIDDEN"})
     filter_glob: StringProperty(default=";".join(f"*{e}" for e in SUFFIXES), options={"HIDDEN"})
 
@@ -160,15 +160,21 @@ class FEWVIEW_OT_remove_image(_OnList, bpy.types.Operator):
 
 
 class FEWVIEW_OT_clear_images(_OnList, bpy.types.Operator):
-    """Take all photographs off the list; the files stay"""
+    """Take all photographs off the list, and cameras and true mesh that lie beside them; the files stay"""
 
     bl_idname = "fewview.clear_images"
     bl_label = "Clear List"
     bl_options = {"REGISTER", "UNDO"}
 
     def execute(self, context: bpy.types.Context) -> set[str]:
-        """Remove all."""
-        settings_of(context).images.clear()
+        """Remove all, and what is of use for these alone."""
+        settings = settings_of(context)
+        beside = {Path(bpy.path.abspath(image.path)).parent.parent for image in settings.images}
+        if Path(bpy.path.abspath(settings.cameras_path)).parent in beside:
+            settings.camera_source, settings.cameras_path = "ESTIMATE", ""
+        if Path(bpy.path.abspath(settings.truth)).parent in beside:
+            settings.truth = ""
+        settings.images.clear()
         return {"FINISHED"}
 
 

@@ -8,7 +8,7 @@ from bpy.props import StringProperty
 from .. import colours
 from ..error_map import measure_steps
 from ..properties import settings_of
-from ..scenes import object_named
+from ..scenes import object_or_none
 from .on_result import OnResult, Status, refused, result_of
 
 _TICK_S = 0.01
@@ -70,9 +70,9 @@ class FEWVIEW_OT_measure_error(OnResult, bpy.types.Operator):
         target = settings_of(context).target
         if not self.truth:
             return [] if target is None else [target]
-        whole = object_named(context.scene, self.truth)  # its name may have a comma
+        whole = object_or_none(context.scene, self.truth)  # its name may have a comma
         names = [self.truth] if whole else [name.strip() for name in self.truth.split(",")]
-        found = {name: object_named(context.scene, name) for name in names}
+        found = {name: object_or_none(context.scene, name) for name in names}
         if missing := [name for name, made in found.items() if made is None]:
             raise ValueError(f"There is no object {', '.join(missing)} in this scene")
         return [made for made in found.values() if made is not None]

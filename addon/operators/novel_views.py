@@ -16,12 +16,16 @@ from ..camera_objects import JOB, selected_cameras
 from ..frames import world_from_result
 from ..job_folder import LOG, can_be_rendered, inside, new_folder, results_in
 from ..placing import solved_from_camera
-from ..properties import settings_of
+from ..properties import IN_BLEND, settings_of
 from ..result_mesh import result_or_none
+from ..scenes import object_or_none
 from ..solved import SolvedCamera, write_cameras
 from ..view_rendering import IMAGES, TRANSFORMS
 from .environment import backend_python_or_reason, reason_against_a_job
 from .on_result import OnResult, Status, has_result, refused, result_of
+
+_LONGEST_NAME = 60
+"""Letters, of up to four bytes each."""
 
 
 class FEWVIEW_OT_render_novel_views(OnResult, bpy.types.Operator):
@@ -40,7 +44,7 @@ class FEWVIEW_OT_render_novel_views(OnResult, bpy.types.Operator):
         name="Output",
         description="Folder in which the pictures get their own; that of the job where this is empty",
         subtype="DIR_PATH",
-        options={"SKIP_SAVE"},
+        options={"SKIP_SAVE", *IN_BLEND},
     )
 
     @classmethod
@@ -84,7 +88,7 @@ def _cameras(context: bpy.types.Context, names: str) -> list[bpy.types.Object]:
     """Those of the names, one a line, or else the selected ones, or else the scene's. Raises ValueError."""
     found = []
     for name in filter(None, map(str.strip, names.splitlines())):
-        made = context.scene.objects.get(name)
+        made = object_or_none(context.scene, name)
         if made is None or made.type != "CAMERA":
             raise ValueError(f"There is no camera {name} in the scene")
         found.append(made)
@@ -118,8 +122,11 @@ def _as_the_job_has_them(
 
 
 def _file_name(camera: str, taken: Sequence[str]) -> str:
-    """Of the camera's picture: file systems know fewer letters than Blender, and not all know their case."""
-    stem, number = re.sub(r"[^\w-]", "_", camera), 1
+    """Of the camera's picture: file systems know fewer letters than Blender, and not all know their case.
+
+    Nor do they know names of 255 bytes with an ending.
+    """
+    stem, number = re.sub(r"[^\w-]", "_", camera)[:_LONGEST_NAME], 1
     name = f"{IMAGES}/{stem}.png"
     while name.casefold() in map(str.casefold, taken):
         number += 1

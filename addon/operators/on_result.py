@@ -6,7 +6,7 @@ import bpy
 from bpy.props import StringProperty
 
 from ..result_mesh import result_or_none
-from ..scenes import object_named
+from ..scenes import object_or_none
 
 Status = set[str]
 RECONSTRUCT_FIRST = "Reconstruct first, or bring a result back from Past Jobs"
@@ -25,7 +25,7 @@ def has_result(cls: Any, context: bpy.types.Context) -> bool:
 
 def result_of(context: bpy.types.Context, name: str) -> bpy.types.Object:
     """The mesh object of this name; without a name the result that is meant. Raises ValueError for others."""
-    result = object_named(context.scene, name) if name else result_or_none(context)
+    result = object_or_none(context.scene, name) if name else result_or_none(context)
     if result is None or result.type != "MESH":
         raise ValueError(f"There is no mesh {name} in this scene" if name else RECONSTRUCT_FIRST)
     return result

@@ -46,7 +46,7 @@ def jobs_parent(context: bpy.types.Context, given: str = "") -> Path:
     In this order: given, the scene's, beside the .blend, the preferences'.
     """
     chosen = given or settings_of(context).output
-    if chosen:
+    if chosen and (bpy.data.filepath or not chosen.startswith("//")):  # else // is where Blender was started
         return Path(bpy.path.abspath(chosen)).absolute()
     if bpy.data.filepath:
         return Path(bpy.data.filepath).parent / "fewview"

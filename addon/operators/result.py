@@ -9,7 +9,7 @@ from bpy.props import BoolProperty, FloatProperty, StringProperty
 
 from .. import colours, result_mesh
 from ..job_folder import FolderError, past_jobs
-from ..properties import settings_of
+from ..properties import IN_BLEND, settings_of
 from ..result_import import import_result_steps
 from ..result_mesh import result_or_none
 from .measure import FEWVIEW_OT_measure_error
@@ -36,9 +36,9 @@ class FEWVIEW_OT_import_result(bpy.types.Operator):
         name="Job",
         description="Folder of the job; the newest one where this is empty",
         subtype="DIR_PATH",
-        options={"SKIP_SAVE", "HIDDEN"},
+        options={"SKIP_SAVE", *IN_BLEND, "HIDDEN"},
     )
-    directory: StringProperty(subtype="DIR_PATH", options={"SKIP_SAVE", "HIDDEN"})
+    directory: StringProperty(subtype="DIR_PATH", options={"SKIP_SAVE", *IN_BLEND, "HIDDEN"})
     cameras: BoolProperty(name="Cameras", description="Import the cameras and the points, too", default=True)
 
     @classmethod

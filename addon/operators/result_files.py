@@ -8,6 +8,7 @@ from bpy.props import BoolProperty, EnumProperty, StringProperty
 
 from .. import result_mesh
 from ..camera_objects import JOB
+from ..frames import chosen_job_or_none
 from ..job_folder import (
     CAMERAS_PAGE,
     REPORT_NUMBERS,
@@ -18,7 +19,7 @@ from ..job_folder import (
     read_job,
     results_in,
 )
-from ..properties import settings_of
+from ..properties import IN_BLEND, settings_of
 from ..result_mesh import result_or_none
 from .on_result import RECONSTRUCT_FIRST, OnResult, Status, refused, result_of
 from .reconstruct import jobs_parent
@@ -30,7 +31,7 @@ class FEWVIEW_OT_export(OnResult, bpy.types.Operator):
     bl_idname = "fewview.export"
     bl_label = "Export Mesh"
 
-    filepath: StringProperty(name="File", subtype="FILE_PATH", options={"SKIP_SAVE"})
+    filepath: StringProperty(name="File", subtype="FILE_PATH", options={"SKIP_SAVE", *IN_BLEND})
     filter_glob: StringProperty(
         default=";".join(f"*{end}" for end in result_mesh.FORMATS), options={"HIDDEN"}
     )
@@ -91,7 +92,7 @@ class _OnFolder:
         name="Job",
         description="Folder of the job; that of the selected result, or of the newest, where this is empty",
         subtype="DIR_PATH",
-        options={"SKIP_SAVE"},
+        options={"SKIP_SAVE", *IN_BLEND},
     )
 
     def _job_folder(self, context: bpy.types.Context) -> Path:
@@ -129,12 +130,11 @@ class FEWVIEW_OT_open_report(_OnFolder, bpy.types.Operator):
 
 
 def camera_page_or_none(context: bpy.types.Context) -> Path | None:
-    """What the job that found the cameras alone tells of them; None where there was none, or it is gone."""
-    chosen = settings_of(context).cameras_job
-    folder = Path(bpy.path.abspath(chosen))
+    """What the job tells of the cameras that step 2 is set to; None where none found them, or it is gone."""
+    folder = chosen_job_or_none(settings_of(context))
     try:
-        page = inside(folder, results_in(folder) / CAMERAS_PAGE)
-        return page if chosen and page.is_file() else None
+        page = None if folder is None else inside(folder, results_in(folder) / CAMERAS_PAGE)
+        return page if page is not None and page.is_file() else None
     except (FolderError, OSError):
         return None
 

@@ -151,7 +151,8 @@ class FEWVIEW_OT_render_views(bpy.types.Operator):
             request = self._request(context)
             folder = new_folder(jobs_parent(context, self.output), "views")
             if render_worker.needs_waiting():
-                render_worker.render_here(request, folder)
+                for sentence in render_worker.render_here(request, folder):
+                    self.report({"WARNING"}, sentence)
                 for _ in take_views(context.scene.session_uid, folder):
                     pass
                 return {"FINISHED"}
@@ -166,7 +167,9 @@ class FEWVIEW_OT_render_views(bpy.types.Operator):
         views = _views(context, self.view_cameras, self.frame_step)
         if len(views) > MOST_VIEWS:
             raise ValueError(f"{len(views)} views are too many: take fewer frames")
-        target = _target(context, self)
+        target, chosen = _target(context, self), settings_of(context).target
+        if target is None and chosen is not None and not self.properties.is_property_set("target"):
+            raise ValueError(f"{chosen.name} is no longer in the scene: choose another object, or none")
         return ViewRequest(
             scene=context.scene.name_full,
             view_layer=context.view_layer.name,
@@ -179,9 +182,13 @@ class FEWVIEW_OT_render_views(bpy.types.Operator):
         )
 
     def _start(self, scene: bpy.types.Scene, request: ViewRequest, folder: Path) -> None:
-        for sentence in render_worker.not_copied(scene, request):
-            self.report({"WARNING"}, sentence)
-        render_worker.prepare(scene, request, folder)
+        try:
+            render_worker.prepare(scene, request, folder)
+        except (RuntimeError, OSError) as error:
+            render_worker.clean(folder)
+            raise ValueError(
+                f"The scene cannot be copied to {folder}: is the disk full? ({error})"
+            ) from error
         scene_uid = scene.session_uid
         jobs.start(
             "Rendering views",
@@ -194,6 +201,9 @@ class FEWVIEW_OT_render_views(bpy.types.Operator):
             environment=os.environ,
             noisy_start=True,
         )
+        running = jobs.running()
+        if running is not None:
+            running.warnings += render_worker.not_copied()
 
 
 def take_views(scene_uid: int, folder: Path) -> Iterator[None]:
@@ -222,10 +232,7 @@ def _target(context: bpy.types.Context, operator: bpy.types.Operator) -> bpy.typ
         return in_scene(context.scene, settings_of(context).target)
     if not operator.target:
         return None
-    found = object_named(context.scene, operator.target)
-    if found is None:
-        raise ValueError(f"There is no object {operator.target} in the scene")
-    return found
+    return object_named(context.scene, operator.target)
 
 
 def _views(context: bpy.types.Context, source: str, frame_step: int) -> tuple[View, ...]:

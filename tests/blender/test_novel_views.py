@@ -221,12 +221,43 @@ def test_the_selected_cameras_else_the_scenes(result: Any, started: list[tuple[s
     assert written(3) == ["images/b.png"]
 
 
+def test_a_linked_camera_of_the_same_name_is_another_one(
+    result: Any, started: list[tuple[str, ...]], tmp_path: Path
+) -> None:
+    points = world_points(result)
+    other = camera("Camera", points, (0, 0, 1))
+    bpy.data.libraries.write(str(tmp_path / "other.blend"), {other}, fake_user=True)
+    bpy.data.objects.remove(other)
+    with bpy.data.libraries.load(str(tmp_path / "other.blend"), link=True) as (_, wanted):
+        wanted.objects = ["Camera"]
+    (linked,) = wanted.objects
+    bpy.context.scene.collection.objects.link(linked)
+    own = camera("Camera", points, (1, 0, 0))
+    assert own.name == linked.name
+    assert bpy.ops.fewview.render_novel_views(cameras=f"{linked.name_full}\nCamera") == {"FINISHED"}
+    written = frames(job_of(result) / "novel-views-001")
+    assert [frame["file_path"] for frame in written] == ["images/Camera.png", "images/Camera_2.png"]
+    for made, frame in zip((linked, own), written, strict=True):
+        np.testing.assert_allclose(seen_by_the_job(frame), seen_by_blender(made, points), atol=0.05)
+
+
 def test_pictures_have_names_that_any_disk_can_keep(result: Any, started: list[tuple[str, ...]]) -> None:
     for name in ("Camera.001", "camera_001", "../up", "Büste"):
         camera(name, world_points(result), (1, 0, 0))
     bpy.ops.fewview.render_novel_views(cameras="Camera.001\ncamera_001\n../up\nBüste")
     names = [frame["file_path"] for frame in frames(job_of(result) / "novel-views-001")]
     assert names == [f"images/{name}.png" for name in ("Camera_001", "camera_001_2", "___up", "Büste")]
+
+
+def test_the_longest_names_of_blender_are_cut(result: Any, started: list[tuple[str, ...]]) -> None:
+    """With its ending a name of 255 bytes, as Blender has them from 5.0 on, is longer than a disk takes."""
+    points = world_points(result)
+    for _ in range(2):
+        camera("日" * 85, points, (1, 0, 0))
+    bpy.ops.fewview.render_novel_views()
+    names = [Path(frame["file_path"]).name for frame in frames(job_of(result) / "novel-views-001")]
+    assert len(set(names)) == 2
+    assert max(len(name.encode()) for name in names) <= 255
 
 
 def test_another_output_folder(result: Any, started: list[tuple[str, ...]], tmp_path: Path) -> None:

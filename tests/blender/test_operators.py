@@ -235,6 +235,25 @@ def names_in(settings: Any) -> list[str]:
 # Words.
 
 
+@pytest.mark.skipif(bpy.app.version < (4, 5), reason="every path may begin with // before")
+def test_every_path_may_be_relative_to_the_file() -> None:
+    """Else Blender warns of //, and its file browser gives none that survives when a project is moved."""
+    owners = [
+        bpy.context.scene.fewview.bl_rna,
+        bpy.context.scene.fewview.bl_rna.properties["images"].fixed_type,
+    ]
+    names = [name for name in dir(bpy.ops.fewview) if name not in {"check_backend", "install_backend"}]
+    owners += [getattr(bpy.ops.fewview, name).get_rna_type() for name in names]
+    paths = [
+        (owner.identifier, prop.identifier, prop.is_path_supports_blend_relative)
+        for owner in owners
+        for prop in owner.properties
+        if prop.type == "STRING" and prop.subtype in {"FILE_PATH", "DIR_PATH"}
+    ]
+    assert len(paths) > 15
+    assert [path for path in paths if not path[2]] == []
+
+
 def test_every_operator_is_in_the_table() -> None:
     assert set(dir(bpy.ops.fewview)) == set(OPERATORS)
 

@@ -612,6 +612,9 @@ def test_the_report_of_the_cameras_has_a_button_while_it_is_there(sidebar: Sideb
         page.touch() if there else page.unlink()
         found = sidebar.draw_all()
         assert ["fewview.open_camera_report" in found[step].operators() for step in steps] == [there] * 2
+    page.touch()
+    bpy.context.scene.fewview.camera_source = "KNOWN"  # others than those of the report
+    assert "fewview.open_camera_report" not in sidebar.draw_all()["FEWVIEW_PT_result"].operators()
 
 
 def test_a_result_without_colours_and_support(sidebar: Sidebar) -> None:

@@ -154,7 +154,7 @@ def test_generating_around_nothing_says_why(addon: ModuleType) -> None:
     with pytest.raises(RuntimeError, match="Add an object"):
         bpy.ops.fewview.generate_views()
     bpy.ops.object.empty_add()
-    with pytest.raises(RuntimeError, match="no visible surface"):
+    with pytest.raises(RuntimeError, match="Empty: there is no visible surface; show it, or choose another"):
         bpy.ops.fewview.generate_views()
     with pytest.raises(RuntimeError, match="no object Moon"):
         bpy.ops.fewview.generate_views(target="Moon")
@@ -184,6 +184,39 @@ def test_rendered_views_are_exact_masked_and_taken_over(cube: Any, tmp_path: Pat
     assert (settings.source, settings.camera_source) == ("RENDER", "KNOWN")
     assert settings.cameras_path == str(folder / "transforms.json")
     assert settings.truth == str(folder / "truth.ply")
+
+
+def test_what_came_with_rendered_views_goes_with_them(cube: Any, tmp_path: Path) -> None:
+    """Else the photographs that come after them would be measured against the views' object."""
+    generate(view_count=2)
+    rendered(tmp_path / "jobs")
+    settings = bpy.context.scene.fewview
+    bpy.ops.fewview.clear_images()
+    assert (settings.camera_source, settings.cameras_path, settings.truth) == ("ESTIMATE", "", "")
+    rendered(tmp_path / "jobs")
+    settings.cameras_path = settings.truth = str(tmp_path / "own")
+    bpy.ops.fewview.clear_images()
+    assert (settings.camera_source, settings.cameras_path) == ("KNOWN", settings.truth)
+
+
+def test_where_nothing_can_be_written_says_what_to_do(cube: Any, tmp_path: Path) -> None:
+    generate(view_count=2)
+    (tmp_path / "file").touch()
+    with pytest.raises(RuntimeError, match=r"jobs cannot be written \(.*\): choose another output folder"):
+        bpy.ops.fewview.render_views(output=str(tmp_path / "file" / "jobs"))
+
+
+def test_beside_a_file_that_is_not_saved_is_nowhere(
+    part: Callable[[str], ModuleType], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A startup file may have such a setting; Blender would take the folder that it was started in."""
+    jobs_parent = part("operators.reconstruct").jobs_parent
+    monkeypatch.chdir(tmp_path)
+    unset = jobs_parent(bpy.context)
+    bpy.context.scene.fewview.output = "//jobs"
+    assert jobs_parent(bpy.context) == unset
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "own.blend"))
+    assert jobs_parent(bpy.context) == tmp_path / "jobs"
 
 
 def test_a_second_rendering_gets_a_folder_of_its_own(cube: Any, tmp_path: Path) -> None:
@@ -513,6 +546,41 @@ def test_an_object_that_is_in_no_picture_says_why(cube: Any, tmp_path: Path) -> 
     assert state() == before
 
 
+def test_an_object_that_was_deleted_says_so(cube: Any, tmp_path: Path) -> None:
+    """The field still shows it; without an object there would be no masks."""
+    generate(view_count=2)
+    bpy.context.scene.collection.objects.unlink(cube)
+    with pytest.raises(RuntimeError, match="Cube is no longer in the scene: choose another object, or none"):
+        rendered(tmp_path)
+    assert rendered(tmp_path, target="")
+
+
+@pytest.mark.parametrize(("energy", "is_told"), [(0.0, True), (2.0, False), (20.0, True)])
+def test_too_much_light_and_none_are_told(
+    cube: Any,
+    second_blender: ModuleType,
+    part: Callable[[str], ModuleType],
+    tmp_path: Path,
+    energy: float,
+    is_told: bool,
+) -> None:
+    """Of which AgX, in the viewport, shows the one and Solid mode the other."""
+    bpy.data.objects["Sun"].data.energy = energy
+    bpy.context.scene.world = bpy.data.worlds.new("grey") if energy else None
+    bpy.context.scene.view_settings.view_transform = "AgX"
+    generate(view_count=2)
+    rendered(tmp_path)
+    told = part("jobs").ended().warnings
+    assert bool(told) == is_told
+    assert all("white or black without texture in 2 of 2 views: change the lights" in text for text in told)
+
+
+def test_samples_are_those_that_are_asked_for(cube: Any, rendering: ModuleType) -> None:
+    layer = bpy.context.view_layer
+    layer.samples = 4096  # which count before the scene's
+    assert (layer, "samples", 0) in rendering.render_changes(bpy.context.scene, request(rendering))
+
+
 def test_a_linked_object_of_the_same_name_is_another_one(cube: Any, tmp_path: Path) -> None:
     bpy.data.libraries.write(str(tmp_path / "other.blend"), {cube}, fake_user=True)
     with bpy.data.libraries.load(str(tmp_path / "other.blend"), link=True) as (_, wanted):
@@ -538,6 +606,26 @@ def test_objects_behind_the_scene_are_not_in_the_mask(cube: Any, tmp_path: Path)
     bpy.context.scene.background_set = behind
     assert_pictures_show_the_truth(rendered(tmp_path, target="Cube"))
     assert floor.visible_camera
+
+
+def test_fog_is_not_in_the_mask(cube: Any, tmp_path: Path) -> None:
+    world = bpy.context.scene.world = bpy.data.worlds.new("foggy")
+    if world.node_tree is None:  # before Blender 5.0 a new world has no nodes
+        world.use_nodes = True
+    tree = world.node_tree
+    fog = tree.nodes.new("ShaderNodeVolumeScatter")
+    fog.inputs["Density"].default_value = 0.05
+    output = next(node for node in tree.nodes if node.type == "OUTPUT_WORLD")
+    link = tree.links.new(fog.outputs[0], output.inputs["Volume"])
+    generate(view_count=2, target="Cube")
+    assert_pictures_show_the_truth(rendered(tmp_path, target="Cube"))
+    assert not link.is_muted
+
+
+def test_workbench_does_not_see_through_the_subject(cube: Any, rendering: ModuleType) -> None:
+    """Not rendered, as it needs a GPU or its software: the mask would be as transparent as the X-ray."""
+    shading = bpy.context.scene.display.shading
+    assert (shading, "show_xray", False) in rendering.render_changes(bpy.context.scene, request(rendering))
 
 
 def test_pencils_are_hidden_from_every_engine(cube: Any, rendering: ModuleType) -> None:
@@ -868,45 +956,173 @@ def test_a_second_blender_renders_what_is_not_saved(
     assert {path: path.read_bytes() for path in before} == before
 
 
-def test_a_second_blender_has_what_was_simulated(
-    cube: Any, second_blender: ModuleType, tmp_path: Path
-) -> None:
-    """Neither the frames of a cloth nor where it lies are to be had without them."""
-    scene = bpy.context.scene
+def add_cloth(_: Path) -> Any:
     bpy.ops.mesh.primitive_grid_add(x_subdivisions=4, y_subdivisions=4, location=(3, 1, 3))
-    cloth = bpy.context.object
-    cloth.modifiers.new("Cloth", "CLOTH").point_cache.frame_end = 12
+    bpy.context.object.modifiers.new("Cloth", "CLOTH").point_cache.frame_end = 12
+    return bpy.context.object
+
+
+def cloth_collection() -> Any:
+    """The cloth in a collection that is not in the scene."""
+    cloth = add_cloth(Path())
+    bpy.context.scene.collection.objects.unlink(cloth)
+    collection = bpy.data.collections.new("Clothes")
+    collection.objects.link(cloth)
+    return collection
+
+
+def add_instance(collection: Any) -> Any:
+    shown = bpy.data.objects.new("Shown", None)
+    shown.instance_type, shown.instance_collection = "COLLECTION", collection
+    bpy.context.scene.collection.objects.link(shown)
+    return shown
+
+
+def linked_clothes(tmp_path: Path) -> Any:
+    path = str(tmp_path / "clothes.blend")
+    collection = cloth_collection()
+    bpy.data.libraries.write(path, {collection}, fake_user=True)
+    bpy.data.batch_remove([*collection.objects, collection])
+    with bpy.data.libraries.load(path, link=True) as (_, wanted):
+        wanted.collections = ["Clothes"]
+    return wanted.collections[0]
+
+
+def overridden_cloth(tmp_path: Path) -> Any:
+    scene = bpy.context.scene
+    clothes = linked_clothes(tmp_path).override_hierarchy_create(scene, bpy.context.view_layer)
+    if clothes not in scene.collection.children_recursive:
+        scene.collection.children.link(clothes)
+    return clothes.objects[0]
+
+
+def add_cloth_on_disk(tmp_path: Path) -> Any:
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "own.blend"))  # else there is no cache on disk
+    cloth = add_cloth(tmp_path)
+    cloth.modifiers["Cloth"].point_cache.use_disk_cache = True
+    return cloth
+
+
+def add_baked_cloth_on_disk(tmp_path: Path) -> Any:
+    cloth = add_cloth_on_disk(tmp_path)
+    with bpy.context.temp_override(point_cache=cloth.modifiers["Cloth"].point_cache):
+        bpy.ops.ptcache.bake(bake=True)
+    assert cloth.modifiers["Cloth"].point_cache.is_baked
+    return cloth
+
+
+def add_rigid_body(_: Path) -> Any:
+    falling = add_cube("Falling", 1.0, (3, 1, 3))
+    bpy.ops.rigidbody.object_add(type="ACTIVE")
+    return falling
+
+
+def add_zone(_: Path) -> Any:
+    """A cube that sinks by a simulation zone of Geometry Nodes."""
+    sinking = add_cube("Sinking", 1.0, (3, 1, 3))
+    tree = bpy.data.node_groups.new("sink", "GeometryNodeTree")
+    for way in ("INPUT", "OUTPUT"):
+        tree.interface.new_socket("Geometry", in_out=way, socket_type="NodeSocketGeometry")
+    kinds = ("NodeGroupInput", "GeometryNodeSimulationInput", "GeometryNodeTransform")
+    came, begins, moved = (tree.nodes.new(kind) for kind in kinds)
+    ends, goes = (tree.nodes.new(kind) for kind in ("GeometryNodeSimulationOutput", "NodeGroupOutput"))
+    begins.pair_with_output(ends)
+    moved.inputs["Translation"].default_value = (0, 0, -0.1)
+    for start, end in (
+        (came.outputs[0], begins.inputs["Geometry"]),
+        (begins.outputs["Geometry"], moved.inputs["Geometry"]),
+        (moved.outputs[0], ends.inputs["Geometry"]),
+        (ends.outputs["Geometry"], goes.inputs[0]),
+    ):
+        tree.links.new(start, end)
+    sinking.modifiers.new("Sink", "NODES").node_group = tree
+    return sinking
+
+
+def add_baked_zone(tmp_path: Path) -> Any:
+    """It was baked to a disk, beside the file, and would sink slower by now."""
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "own.blend"))
+    sinking = add_zone(tmp_path)
+    modifier = sinking.modifiers["Sink"]
+    if hasattr(modifier, "bake_target"):
+        modifier.bake_target = "DISK"
+    bpy.context.view_layer.update()
+    bake = modifier.bakes[0]
+    bake.use_custom_simulation_frame_range, bake.frame_start, bake.frame_end = True, 1, 12
+    bpy.ops.object.geometry_node_bake_single(
+        session_uid=sinking.session_uid, modifier_name="Sink", bake_id=bake.bake_id
+    )
+    assert modifier.bake_directory.startswith("//")
+    nodes = modifier.node_group.nodes
+    next(node for node in nodes if node.type == "TRANSFORM_GEOMETRY").inputs["Translation"].default_value = (
+        *(0, 0, -0.01),
+    )
+    return sinking
+
+
+@pytest.mark.parametrize(
+    "simulated",
+    [
+        add_cloth,
+        lambda _: add_instance(cloth_collection()),
+        lambda tmp_path: add_instance(linked_clothes(tmp_path)),
+        overridden_cloth,
+        add_cloth_on_disk,
+        add_baked_cloth_on_disk,
+        add_rigid_body,
+        add_zone,
+        add_baked_zone,
+    ],
+    ids=[
+        "cloth",
+        "instanced",
+        "linked",
+        "overridden",
+        "disk",
+        "baked disk",
+        "rigid body",
+        "zone",
+        "baked zone",
+    ],
+)
+def test_a_second_blender_has_what_was_simulated(
+    cube: Any,
+    second_blender: ModuleType,
+    part: Callable[[str], ModuleType],
+    tmp_path: Path,
+    simulated: Callable[[Path], Any],
+) -> None:
+    """Neither the frames of a simulation nor where things lie are to be had without those before."""
+    target = simulated(tmp_path)
+    scene, before = bpy.context.scene, bpy.data.filepath
     for frame in range(1, 13):
         scene.frame_set(frame)
-    fallen = cloth.evaluated_get(bpy.context.evaluated_depsgraph_get()).data.vertices[0].co.z
-    assert fallen < -0.3
-    generate(view_count=2, target=cloth.name)
-    folder = rendered(tmp_path, target=cloth.name)
-    lowest = true_surface(folder).positions[:, 2].min()
-    assert lowest == pytest.approx(3 + fallen, abs=0.01)
-    assert bpy.data.filepath == ""
-    assert not (folder / second_blender.COPY).exists()
+    fallen = part("true_mesh").true_mesh((target,)).vertices
+    assert fallen[:, 2].min() < 2.6
+    generate(view_count=2, target=target.name)
+    folder = rendered(tmp_path, target=target.name)
+    np.testing.assert_allclose(true_surface(folder).positions, fallen, atol=0.01)
+    assert_pictures_show_the_truth(folder)
+    assert bpy.data.filepath == before
+    assert sorted(path.name for path in folder.iterdir()) == [
+        *("images", "render.log", "transforms.json", "truth.ply"),
+    ]
 
 
 def test_what_a_second_blender_lacks_is_said(
-    cube: Any, second_blender: ModuleType, rendering: ModuleType, tmp_path: Path
+    cube: Any, second_blender: ModuleType, part: Callable[[str], ModuleType], tmp_path: Path
 ) -> None:
-    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "own.blend"))  # else there is no cache on disk
-    scene = bpy.context.scene
-    wanted = request(rendering, views=(rendering.View(camera=""), rendering.View(camera="", frame=5)))
-    assert second_blender.not_copied(scene, wanted) == ()
+    assert second_blender.not_copied() == ()
     image = bpy.data.images.new("painted", 2, 2)
     image.pixels = [0.0] * 16
     image.pack()
-    assert second_blender.not_copied(scene, wanted) == ()
+    assert second_blender.not_copied() == ()
     image.pixels = [1.0] * 16
-    cube.modifiers.new("Cloth", "CLOTH").point_cache.use_disk_cache = True
-    assert second_blender.not_copied(scene, wanted) == (
-        "Rendered as they were last saved or packed: painted",
-        "Rendered without what is simulated in a cache on disk: Cube",
-    )
-    first = request(rendering, views=(rendering.View(camera=""),))  # where nothing is simulated yet
-    assert len(second_blender.not_copied(scene, first)) == 1
+    (sentence,) = second_blender.not_copied()
+    assert sentence == "Rendered as they were last saved or packed: painted"
+    generate(view_count=2)
+    rendered(tmp_path)
+    assert sentence in part("jobs").ended().warnings  # where the panel shows it
 
 
 def test_an_error_in_the_second_blender_reaches_the_first(
@@ -917,6 +1133,16 @@ def test_an_error_in_the_second_blender_reaches_the_first(
         bpy.ops.fewview.render_views(output=str(tmp_path), **SMALL)
     assert not (tmp_path / "views-001/transforms.json").exists()
     assert not (tmp_path / "views-001" / second_blender.COPY).exists()
+
+
+def test_a_scene_that_cannot_be_copied_says_so(
+    cube: Any, second_blender: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    generate(view_count=2)
+    monkeypatch.setattr(second_blender, "COPY", "nowhere/scene.blend")
+    with pytest.raises(RuntimeError, match=r"cannot be copied to .*views-001: is the disk full\?"):
+        bpy.ops.fewview.render_views(output=str(tmp_path), **SMALL)
+    assert not list((tmp_path / "views-001").iterdir())
 
 
 def test_nothing_is_left_of_a_second_blender_that_does_not_start(
