@@ -30,6 +30,7 @@ from .stages.camera_refinement import match_solved, with_refined
 from .stages.camera_report import build_camera_report
 from .stages.cameras import solve_cameras
 from .stages.confirmation import unconfirmed
+from .stages.disagreement import disagreement
 from .stages.known_cameras import may_be_unturned
 from .stages.mesh import extract_mesh
 from .stages.neus_fit import NeusConfig, fit_neus
@@ -41,6 +42,7 @@ from .stages.photos import (
     named_photos,
     turned_text,
     unused_masks_text,
+    white_masks_text,
     without_masks_text,
 )
 from .stages.radiance_field import Radiance
@@ -298,6 +300,8 @@ def _placed(
     photos = tuple(replace(photo, path=files.photos[photo.name]) for photo in photos)
     if job.masks and (bare := [photo.name for photo in photos if photo.mask is None]):
         this.warn(without_masks_text(bare))
+    if text := white_masks_text(photos):
+        this.warn(text)
     cameras_in_doubt = job.cameras is not None and may_be_unturned(job.cameras)
     doubtful = [photo for photo in photos if cameras_in_doubt or photo.name in files.mask_contents]
     if text := turned_text(doubtful):
@@ -309,7 +313,10 @@ def _placed(
     if doubt := unconfirmed(solved):
         this.warn(doubt)
     del photos, solve  # the views hold what is needed of them
-    return solved, this.stage("region", partial(stages.find_region, solved, settings.region))
+    region = this.stage("region", partial(stages.find_region, solved, settings.region))
+    if region.doubt:
+        this.warn(region.doubt)
+    return solved, region
 
 
 def _reconstructed(
@@ -330,6 +337,8 @@ def _reconstructed(
     stereo = this.stage("stereo", match)
     if settings.stereo is not None and (lack := hollows_filled(stereo)):
         this.warn(lack)
+    for doubt in disagreement(solved, stereo):
+        this.warn(doubt)
     solved = with_refined(solved, stereo)
     views = solved.views
     if len(stereo.points.positions):

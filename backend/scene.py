@@ -173,6 +173,8 @@ class Region:
     object_from_world: Float64[np.ndarray, "4 4"]
     """A similarity: uniform scale, rotation, translation."""
     decisions: tuple[Decision, ...] = ()
+    doubt: str | None = None
+    """For a person: what speaks against it, and what helps; None if nothing does."""
 
     @property
     def world_from_object(self) -> Float64[np.ndarray, "4 4"]:
@@ -238,6 +240,9 @@ class StereoResult:
     depth_maps: tuple[DepthMap, ...]
     refined_cameras: tuple[Camera, ...] | None = None
     """One per view; None where those that stereo was given are as good."""
+    beside_lines_px: float | None = None
+    """How far patches of surface lie beside their epipolar lines for the worst of given cameras; None where
+    these were estimated, or too few patches tell."""
     decisions: tuple[Decision, ...] = ()
 
 

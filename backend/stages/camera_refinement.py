@@ -108,15 +108,18 @@ def match_solved(
 ) -> StereoResult:
     """Stereo of the photographs; where their cameras were estimated and turn out to be off, once more.
 
-    Given cameras are taken at their word. Without a config nothing is compared: what is fitted does not ask.
+    Given cameras are taken at their word, but held against the surface as well. Without a config nothing is
+    compared: what is fitted does not ask.
     Raises what `match_views` does.
     """
     if config is None:
         return unmatched(solved.views)
     work = partial(match_views, region=region, config=config, device=device)
-    if not solved.estimated:
-        return work(solved.views, progress=progress)
     found = work(solved.views, progress=progress)
+    if not solved.estimated:
+        with torch.no_grad():
+            seen = find_patches(solved.views, region, found.points, device=device)
+        return replace(found, beside_lines_px=misplaced_px([view.camera for view in solved.views], seen))
     refined = refine_cameras(solved.views, region, found.points, device=device)
     if refined.cameras is not None:
         views = with_cameras(solved.views, refined.cameras)

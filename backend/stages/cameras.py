@@ -5,7 +5,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ..errors import ErrorCode, ReconstructionError
-from ..scene import Photo, Progress, SolvedCameras
+from ..scene import Photo, Progress, SolvedCameras, Unplaced
+from .copies import originals_of_copies
 from .known_cameras import read_placement
 from .lenses import photo_lens, undistorted_view
 from .structure_from_motion import estimate_placement
@@ -35,9 +36,11 @@ def solve_cameras(
 
     `given` is a nerfstudio transforms.json, a COLMAP model, or a folder with one of them. Cameras that
     FewView's own cameras.json says were estimated are so again, with the points of the sparse.ply beside it.
+    Of photographs without cameras, copies of others are left out.
     Files are written to workdir alone. The same seed gives the same cameras to the bit.
-    Raises ReconstructionError: CAMERAS_UNUSABLE, NO_OVERLAP, NO_PARALLAX, TOO_FEW_PLACED.
+    Raises ReconstructionError: CAMERAS_UNUSABLE, NO_OVERLAP, NO_PARALLAX, TOO_FEW_PHOTOS, TOO_FEW_PLACED.
     """
+    photos, copies = _without_copies(photos) if given is None else (photos, ())
     if given is not None:
         placement = read_placement(photos, given)
     else:
@@ -63,7 +66,7 @@ def solve_cameras(
     return SolvedCameras(
         views=tuple(views),
         lenses=tuple(photo_lens(photos[placed.index], placed) for placed in placement.placed),
-        unplaced=placement.unplaced,
+        unplaced=(*placement.unplaced, *copies),
         estimated=placement.estimated,
         sparse_positions=positions,
         sparse_visibility=visibility,
@@ -71,3 +74,20 @@ def solve_cameras(
         evidence=placement.evidence,
         decisions=placement.decisions,
     )
+
+
+def _without_copies(photos: Sequence[Photo]) -> tuple[Sequence[Photo], tuple[Unplaced, ...]]:
+    """The photographs but for copies of others, and these.
+
+    Raises ReconstructionError(TOO_FEW_PHOTOS) where all are copies of one.
+    """
+    first_of = originals_of_copies(photos)
+    if len(photos) - len(first_of) == 1 < len(photos):
+        text = f"All {len(photos)} photographs are copies of one."
+        remedy = "Take at least two, or better three or more, from different places."
+        raise ReconstructionError(ErrorCode.TOO_FEW_PHOTOS, text, remedy)
+    copies = (
+        Unplaced(name=photos[copy].name, why=f"it is a copy of {photos[first].name}")
+        for copy, first in first_of.items()
+    )
+    return [photo for index, photo in enumerate(photos) if index not in first_of], tuple(copies)

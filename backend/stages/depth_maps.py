@@ -70,8 +70,11 @@ def depth_maps(
 
     A coarse map tells only what no finer one does: where texture is weak, patches must be large.
     All views go through a size together, because what two of them agree on is where maps grow from.
-    `nearby` names for each view those it is compared with.
+    `nearby` names for each view those it is compared with, but for such as show nothing of the region: where
+    points lie behind a camera their matches would run through its picture without end.
     """
+    showing = [bool(pyramid[0].subject.any()) for pyramid in pyramids]
+    nearby = [[other for other in near if showing[other]] for near in nearby]
     top = max(len(pyramid) for pyramid in pyramids) - 1
     maps: list[Map] = []
     by_size: list[list[Measured]] = []

@@ -21,6 +21,8 @@ from ..wire.photographs import (
     spelling,
 )
 
+_WHITE_ON_BLACK = "Make the subject white and the rest black."
+
 
 @dataclass(frozen=True, kw_only=True)
 class PhotosConfig:
@@ -132,6 +134,14 @@ def without_masks_text(names: Sequence[str]) -> str:
     )
 
 
+def white_masks_text(photos: Sequence[Photo]) -> str:
+    """What to say of masks that cut nothing out of any photograph; empty where some do, or there are none."""
+    masks = [photo.mask for photo in photos if photo.mask is not None]
+    if not masks or any((mask <= 0.5).any() for mask in masks):
+        return ""
+    return f"The masks are white all over, so that they cut nothing out. {_WHITE_ON_BLACK}"
+
+
 def turned_text(photos: Sequence[Photo]) -> str:
     """What to say of photographs with masks or cameras that may be of the files' own pixels.
 
@@ -175,7 +185,7 @@ def _load_photo(path: Path, name: str, mask_path: Path | None, config: PhotosCon
         mask = _load_mask(mask_path, name, decoded)
     if mask is not None and mask.max() == 0:
         text = f"The mask of {name} is empty: it leaves nothing of the photograph."
-        raise ReconstructionError(ErrorCode.MASK_UNUSABLE, text, "Make the subject white and the rest black.")
+        raise ReconstructionError(ErrorCode.MASK_UNUSABLE, text, _WHITE_ON_BLACK)
     return Photo(
         name=name,
         path=path,

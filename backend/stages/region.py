@@ -6,6 +6,7 @@ stands whole before an even backdrop is not cut off.
 """
 
 import math
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 
@@ -29,7 +30,13 @@ with things that stand alone 0.6 to 1.1, with a facade 1.6, with a vase on a tab
 LEAST_COMMON = 0.6
 """Share of each mask that what all masks have in common must fill. Measured: 0.88 to 1 with masks that are
 right or a twentieth of the picture off; in the worst photograph 0.2 to 0.5 if one of them is inverted."""
+DOUBTFUL_COMMON = 0.8
+"""Share below which masks are doubted, though they are used. 0.6 to 0.75 if one of them lacks half."""
 
+_FEWEST_SUBJECT_PX = 9
+"""Of a mask: fewer are a slip, as one white dot, against which a subject in grey counts as black."""
+_ONE_PLACE = 1e-9
+"""Of how far cameras are from the origin: nearer to each other, only rounding is between them."""
 
 _CUT_OFF = 0.01
 """Share of what stands whole before a backdrop that the region may leave out."""
@@ -55,17 +62,19 @@ def find_region(solved: SolvedCameras, config: RegionConfig, *, progress: Progre
     """The sphere that holds the subject.
 
     Raises ReconstructionError: NO_SURFACE if the masks have nothing in common, MASK_UNUSABLE if they have
-    hardly anything, CAMERAS_UNUSABLE if the cameras do not look at one place.
+    hardly anything, CAMERAS_UNUSABLE if the cameras do not look at one place, or stand in one.
     """
     progress(0.0, "finding the subject")
+    _check_apart([view.camera for view in solved.views])
     if config.centre_world is not None and config.radius_world is not None:
         centre = np.array(config.centre_world)
         _check_shown(centre, config.radius_world, [view.camera for view in solved.views])
         return _region(centre, config.radius_world, "as given", "set by the user")
     masked = [view for view in solved.views if view.mask is not None]
     if len(masked) >= 2:
-        centre, radius = _of_masks(masked, config)
-        return _region(centre, radius, "the masked subject", f"{len(masked)} photographs have masks")
+        centre, radius, doubt = _of_masks(masked, config)
+        because = f"{len(masked)} photographs have masks"
+        return replace(_region(centre, radius, "the masked subject", because), doubt=doubt)
     cameras = _overviews([view.camera for view in solved.views])
     if len(solved.sparse_positions) >= 20:
         centre, radius = _of_points(solved, cameras)
@@ -79,12 +88,15 @@ def find_region(solved: SolvedCameras, config: RegionConfig, *, progress: Progre
         choice = "where the photographs overlap"
         because = f"no masks, but {len(solved.sparse_positions)} triangulated points"
     else:
-        centre, radius = _of_cameras(cameras)
+        centre, radius = _shown_whole(cameras)
+        if radius <= 0:
+            raise _looking_apart(solved.views, centre)
         choice, because = "what all cameras look at", "neither masks nor triangulated points"
     alone = standing_alone(solved.views)
     if len(alone) >= 2 and (cut_off := share_cut_off(alone, centre, radius)) > _CUT_OFF:
         with suppress(ReconstructionError):  # what each shows may be another thing
-            centre, radius = around_both((centre, radius), _of_masks(alone, config))
+            hull_centre, hull_radius, _ = _of_masks(alone, config)
+            centre, radius = around_both((centre, radius), (hull_centre, hull_radius))
             choice += ", and what stands alone before an even backdrop"
             because += f", which leave out {cut_off:.0%} of what {len(alone)} photographs show whole"
     return _region(centre, radius, choice, because)
@@ -124,6 +136,34 @@ def _check_shown(centre: Float64[np.ndarray, "3"], radius: float, cameras: list[
         )
 
 
+def _check_apart(cameras: list[Camera]) -> None:
+    """Raises ReconstructionError(CAMERAS_UNUSABLE) where all cameras stand in one place."""
+    positions = np.array([camera.position for camera in cameras])
+    if np.ptp(positions, axis=0).max() <= _ONE_PLACE * np.abs(positions).max():
+        raise ReconstructionError(
+            ErrorCode.CAMERAS_UNUSABLE,
+            "All cameras stand in one place, from where photographs show no depth.",
+            "Check the positions in the cameras file.",
+        )
+
+
+def _looking_apart(views: Sequence[View], at: Float64[np.ndarray, "3"]) -> ReconstructionError:
+    """The error of cameras that do not look at what is nearest to all their axes."""
+    away = [view.name for view in views if _depth(view.camera, at) <= 0]
+    others = f" That of {away[0]} looks away from it." if len(away) == 1 else ""
+    return ReconstructionError(
+        ErrorCode.CAMERAS_UNUSABLE,
+        f"The cameras do not look at a common place, so the subject cannot be located.{others}",
+        "Check the cameras file: the matrices of a transforms.json are camera-to-world, of cameras that look "
+        "along their negative z axis with y up.",
+    )
+
+
+def _depth(camera: Camera, at: Float64[np.ndarray, "3"]) -> float:
+    """Of a point before the camera, along its axis."""
+    return float(camera.camera_from_world[2, :3] @ at + camera.camera_from_world[2, 3])
+
+
 def _overviews(cameras: list[Camera]) -> list[Camera]:
     """Those that show about as much as most do: what is not in a close-up may be the subject."""
     centre = nearest_to_axes(cameras)
@@ -151,18 +191,6 @@ def _nearest_to_lines(
     across = np.eye(3) - directions[:, :, None] * directions[:, None]
     right = (across @ origins[:, :, None]).sum(axis=0)[:, 0]
     return np.asarray(np.linalg.lstsq(across.sum(axis=0), right, rcond=1e-9)[0])
-
-
-def _of_cameras(cameras: list[Camera]) -> tuple[Float64[np.ndarray, "3"], float]:
-    """What all cameras look at, where there are no points to tell more."""
-    centre, radius = _shown_whole(cameras)
-    if radius <= 0:
-        raise ReconstructionError(
-            ErrorCode.CAMERAS_UNUSABLE,
-            "The cameras do not look at a common place, so the subject cannot be located.",
-            "Check the cameras file, or give masks of the subject.",
-        )
-    return centre, radius
 
 
 def _shown_whole(cameras: list[Camera]) -> tuple[Float64[np.ndarray, "3"], float]:
@@ -218,17 +246,23 @@ def weighted_quantile(
     return float(values[order][np.searchsorted(cumulative, share * cumulative[-1])])
 
 
-def _of_masks(views: list[View], config: RegionConfig) -> tuple[Float64[np.ndarray, "3"], float]:
-    """Bounding sphere of the visual hull, with room around it."""
+def _of_masks(views: list[View], config: RegionConfig) -> tuple[Float64[np.ndarray, "3"], float, str | None]:
+    """Bounding sphere of the visual hull, with room around it, and what speaks against the masks."""
     try:
-        centre, radius = _of_hull(views, config)
-    except ReconstructionError:  # narrow bars may fall between the middles of all cells
-        centre, radius = _of_hull(views, replace(config, hull_cells=_FINER * config.hull_cells))
-    return centre, radius * config.margin
+        centre, radius, doubt = _of_hull(views, config)
+    except ReconstructionError as error:
+        at = nearest_to_axes([view.camera for view in views])
+        if any(_depth(view.camera, at) <= 0 for view in views):
+            raise _looking_apart(views, at) from error
+        # narrow bars may fall between the middles of all cells
+        centre, radius, doubt = _of_hull(views, replace(config, hull_cells=_FINER * config.hull_cells))
+    return centre, radius * config.margin, doubt
 
 
-def _of_hull(views: list[View], config: RegionConfig) -> tuple[Float64[np.ndarray, "3"], float]:
+def _of_hull(views: list[View], config: RegionConfig) -> tuple[Float64[np.ndarray, "3"], float, str | None]:
     """Bounding sphere of the visual hull: what lies inside the masks of all photographs that show it.
+
+    With it what speaks against the masks.
 
     Photographs from nearly one side leave the hull open in depth; there the subject is taken to be
     at most half again as deep as it is wide.
@@ -252,21 +286,26 @@ def _of_hull(views: list[View], config: RegionConfig) -> tuple[Float64[np.ndarra
         centre = (low + high) / 2
         cell = 2 * radius / config.hull_cells
         radius = float(np.linalg.norm(kept - centre, axis=1).max()) + cell
-    _check_in_common(views, kept, cell)
-    return centre, radius
+    return centre, radius, _doubt_in_common(views, kept, cell)
 
 
-def _check_in_common(views: list[View], hull: Float64[np.ndarray, "cells 3"], cell: float) -> None:
-    """Raises ReconstructionError(MASK_UNUSABLE) if the hull, in such cells, leaves much of a mask empty."""
+def _doubt_in_common(views: list[View], hull: Float64[np.ndarray, "cells 3"], cell: float) -> str | None:
+    """For a person, where the hull, in such cells, leaves a part of a mask empty; None where it does not.
+
+    Raises ReconstructionError(MASK_UNUSABLE) where it leaves much of one empty.
+    """
     filled = {view.name: _share_filled(view, hull, cell) for view in views}
     worst = min(filled, key=lambda name: filled[name])
+    if filled[worst] >= DOUBTFUL_COMMON:
+        return None
+    text = (
+        "The masks contradict each other: "
+        f"what they have in common fills only {filled[worst]:.0%} of the mask of {worst}."
+    )
+    remedy = "Check that all masks are white on the subject and belong to these photographs and cameras."
     if filled[worst] < LEAST_COMMON:
-        raise ReconstructionError(
-            ErrorCode.MASK_UNUSABLE,
-            "The masks contradict each other: "
-            f"what they have in common fills only {filled[worst]:.0%} of the mask of {worst}.",
-            "Check that all masks are white on the subject and belong to these photographs and cameras.",
-        )
+        raise ReconstructionError(ErrorCode.MASK_UNUSABLE, text, remedy)
+    return f"{text} What is cut off in one photograph is cut off the mesh. {remedy}"
 
 
 def _share_filled(view: View, hull: Float64[np.ndarray, "cells 3"], cell: float) -> float:
@@ -307,10 +346,10 @@ def _first_guess(views: list[View]) -> tuple[Float64[np.ndarray, "3"], float]:
     for view in views:
         assert view.mask is not None
         rows, columns = np.nonzero(view.mask > 0.5)
-        if not len(rows):
+        if len(rows) < _FEWEST_SUBJECT_PX:
             raise ReconstructionError(
                 ErrorCode.MASK_UNUSABLE,
-                f"The mask of {view.name} is empty.",
+                f"The mask of {view.name} is empty: only {len(rows)} pixels are brighter than half of white.",
                 "Masks must be white on the subject and black elsewhere.",
             )
         middle = np.array([(columns.min() + columns.max() + 1) / 2, (rows.min() + rows.max() + 1) / 2, 1.0])

@@ -88,8 +88,10 @@ def two_view_points(
     along_b = (np.cross(apart, ray_a) * across).sum(axis=1) * inverse
     on_a, on_b = a.position + along_a[:, None] * ray_a, b.position + along_b[:, None] * ray_b
     gap = np.linalg.norm(on_a - on_b, axis=1) / 2
-    error_px = np.maximum(gap * a.fx_px / np.abs(along_a), gap * b.fx_px / np.abs(along_b))
-    good = (along_a > 0) & (along_b > 0) & (error_px < _LARGEST_ERROR_PX)
+    good = (along_a > 0) & (along_b > 0)
+    # else it is no point anyway: cameras in one place have all of them at 0
+    far_a, far_b = np.where(good, along_a, 1.0), np.where(good, along_b, 1.0)
+    good &= np.maximum(gap * a.fx_px / far_a, gap * b.fx_px / far_b) < _LARGEST_ERROR_PX
     good &= sine2 > np.sin(np.deg2rad(_SMALLEST_ANGLE_DEG)) ** 2
     return (on_a + on_b) / 2, good
 

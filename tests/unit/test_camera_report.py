@@ -20,7 +20,15 @@ from backend.stages.camera_report import (
     point_angles_deg,
 )
 from backend.stages.confirmation import FEWEST_CONFIRMING, num_confirming, unconfirmed
-from tests.synthetic_scene import OBJECT_UNIT, arc_cameras, photographed, surface_points, true_region
+from tests.synthetic_scene import (
+    DISTANCE,
+    OBJECT_UNIT,
+    SIZE,
+    arc_cameras,
+    photographed,
+    surface_points,
+    true_region,
+)
 
 LOST = "lost <1>.png"
 DIAMETER = 2 * OBJECT_UNIT
@@ -122,6 +130,19 @@ def test_cameras_that_no_third_photograph_confirms_are_doubted() -> None:
     assert remark == unconfirmed(weak)
     assert f"only {FEWEST_CONFIRMING - 1} points" in remark
     assert unconfirmed(replace(weak, evidence=None)) is None
+
+
+@pytest.mark.parametrize("apart", [0.0, 0.01])
+def test_a_copy_or_a_burst_confirms_nothing(apart: float) -> None:
+    """The third photograph is taken from beside the second, so many distances to the subject away."""
+    strong = replace(solved(), unplaced=(), evidence=all_strong())
+    first, second, third = strong.views
+    pose = second.camera.camera_from_world.copy()
+    pose[:3, 3] += [apart * DISTANCE * SIZE, 0, 0]
+    beside = replace(third, camera=replace(third.camera, camera_from_world=pose))
+    doubt = unconfirmed(replace(strong, views=(first, second, beside)))
+    assert doubt is not None
+    assert "only 0 points are seen by three photographs from different places" in doubt
 
 
 def weakened() -> SolvedCameras:

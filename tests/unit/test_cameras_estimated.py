@@ -17,7 +17,7 @@ from scipy.ndimage import gaussian_filter
 from scipy.spatial.transform import Rotation
 
 from backend.errors import Cancelled, ErrorCode, ReconstructionError
-from backend.scene import Decision, Photo, SolvedCameras, no_progress
+from backend.scene import Decision, Photo, SolvedCameras, Unplaced, no_progress
 from backend.stages import features, focal_search, model_choice, model_merit
 from backend.stages.camera_report import build_camera_report, camera_report_html, camera_report_numbers
 from backend.stages.cameras import CamerasConfig, solve_cameras
@@ -48,6 +48,18 @@ POSES = {f"{i}.png": arc_pose(angle) for i, angle in enumerate([-18.0, 0.0, 15.0
 @pytest.fixture(scope="module")
 def corner() -> list[Photo]:
     return [make_photo(name, render(pose)) for name, pose in POSES.items()]
+
+
+def test_copies_of_one_photograph_are_told(corner: list[Photo], tmp_path: Path) -> None:
+    """Two copies, and a third photograph, are two; all copies are none to compare."""
+    one, other, _ = corner
+    copy = replace(one, name="copy.png")
+    solved = solve([one, copy, other], tmp_path)
+    assert [view.name for view in solved.views] == [one.name, other.name]
+    assert solved.unplaced == (Unplaced(name="copy.png", why=f"it is a copy of {one.name}"),)
+    with pytest.raises(ReconstructionError, match="All 2 photographs are copies of one") as raised:
+        solve([one, copy], tmp_path)
+    assert raised.value.code == ErrorCode.TOO_FEW_PHOTOS
 
 
 @pytest.mark.parametrize("focal_px", [None, FOCAL_PX * 1.03])

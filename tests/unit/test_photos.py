@@ -17,6 +17,7 @@ from backend.stages.photos import (
     natural_order,
     turned_text,
     unused_masks_text,
+    white_masks_text,
 )
 
 CONFIG = PhotosConfig(max_side_px=100)
@@ -136,6 +137,16 @@ def test_a_mask_counts_before_alpha(tmp_path: Path) -> None:
     assert alpha.mask is not None
     assert masked.mask.min() == 1
     np.testing.assert_allclose(alpha.mask, 0.2, atol=1e-6)
+
+
+def test_masks_that_cut_nothing_out_are_told(tmp_path: Path) -> None:
+    for name in ["a.png", "b.png"]:
+        write(tmp_path / name)
+        write(tmp_path / "white" / name, level=255)
+    assert "white all over" in white_masks_text(load([tmp_path], tmp_path / "white"))
+    assert white_masks_text(load([tmp_path])) == ""
+    Image.fromarray(255 * np.eye(30, 40, dtype=np.uint8)).save(tmp_path / "white" / "a.png")
+    assert white_masks_text(load([tmp_path], tmp_path / "white")) == ""
 
 
 def test_unusable_masks_are_refused(tmp_path: Path) -> None:

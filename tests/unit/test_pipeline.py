@@ -150,6 +150,7 @@ def test_masks_that_are_no_longer_given_are_forgotten(photos: Path, tmp_path: Pa
 
 def test_photographs_without_masks_among_others_with_masks_are_told(photos: Path, tmp_path: Path) -> None:
     masks = make_photos(tmp_path / "masks", 5)
+    Image.fromarray(np.eye(4, 6, dtype=np.uint8)).save(masks / "0.png")  # not white all over
     warned: list[str] = []
     listener = Quiet()
     listener.warned = warned.append  # type: ignore[method-assign]
@@ -183,7 +184,8 @@ def test_what_may_not_be_turned_with_its_photograph_is_told(
     exif = Image.Exif()
     exif[ExifTags.Base.Orientation] = 3
     Image.new("RGB", (6, 4)).save(photos / "1.png", exif=exif)
-    make_photos(tmp_path / "masks", 5)
+    masks = make_photos(tmp_path / "masks", 5)
+    Image.fromarray(np.eye(4, 6, dtype=np.uint8)).save(masks / "0.png")  # not white all over
     (tmp_path / "transforms.json").write_text('{"frames": []}')
     _, warned = found_and_warned(job_of(photos, **{name: tmp_path / path for name, path in given.items()}))
     assert [text for text in warned if "EXIF asks to turn 1.png:" in text] == warned

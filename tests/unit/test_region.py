@@ -98,9 +98,14 @@ def test_the_region_moves_with_the_world() -> None:
     np.testing.assert_allclose(after.radius_world, scale * before.radius_world, rtol=1e-6)
 
 
-def test_an_empty_mask_is_told_by_name() -> None:
+@pytest.mark.parametrize("num_white", [0, 1])
+def test_an_empty_mask_is_told_by_name(num_white: int) -> None:
+    """Also one whose subject is grey, with a white dot that it is measured against."""
     solved = photographed(arc_cameras(3, 40, 80)).solved()
-    empty = replace(solved.views[1], mask=np.zeros_like(solved.views[1].image_srgb[..., 0]))
+    assert solved.views[1].mask is not None
+    grey = np.float32(0.4) * solved.views[1].mask
+    grey[30, 40 : 40 + num_white] = 1
+    empty = replace(solved.views[1], mask=grey)
     with pytest.raises(ReconstructionError, match="view_01") as raised:
         region_of(replace(solved, views=(solved.views[0], empty, solved.views[2])))
     assert raised.value.code == ErrorCode.MASK_UNUSABLE
@@ -121,6 +126,19 @@ def test_masks_that_have_hardly_anything_in_common_are_told(cameras: list[Camera
         region_of(with_first_mask(lambda mask: 1 - mask))
     assert raised.value.code == ErrorCode.MASK_UNUSABLE
     region_of(with_first_mask(lambda mask: np.roll(mask, mask.shape[1] // 20, axis=1)))
+
+
+def test_a_mask_that_lacks_a_half_is_doubted() -> None:
+    """It is used, for it may be right that the others show more, but not without a word."""
+    scene = photographed(arc_cameras(4, 75, 160))
+    first, *others = scene.views
+    assert first.mask is not None
+    cut = first.mask.copy()
+    cut[:, 80:] = 0
+    assert region_of(scene.solved()).doubt is None
+    doubt = region_of(replace(scene, views=(replace(first, mask=cut), *others)).solved()).doubt
+    assert doubt is not None
+    assert "The masks contradict each other" in doubt
 
 
 def test_masks_of_narrow_bars_agree() -> None:
@@ -343,6 +361,38 @@ def test_cameras_that_look_apart_are_told() -> None:
     away = replace(camera_at(90, 0.6, 80), camera_from_world=turned)
     with pytest.raises(ReconstructionError, match="common place") as raised:
         region_of(without_images([looking_in, away]))
+    assert raised.value.code == ErrorCode.CAMERAS_UNUSABLE
+
+
+@pytest.mark.parametrize("masked", [True, False])
+@pytest.mark.parametrize("change", ["world to camera", "camera axes of OpenCV"])
+def test_cameras_in_other_conventions_are_told_what_is_expected(change: str, masked: bool) -> None:
+    scene = photographed(arc_cameras(4, 75, 80))
+    half_turn = np.diag([1.0, -1.0, -1.0, 1.0])
+
+    def changed(camera: Camera) -> Camera:
+        if change == "camera axes of OpenCV":
+            return replace(camera, camera_from_world=half_turn @ camera.camera_from_world)
+        world_from_camera = np.linalg.inv(camera.camera_from_world) @ half_turn
+        return replace(camera, camera_from_world=half_turn @ world_from_camera)
+
+    views = tuple(replace(view, camera=changed(view.camera)) for view in scene.views)
+    scene = replace(scene, views=views)
+    with pytest.raises(ReconstructionError, match="common place") as raised:
+        region_of((scene if masked else scene.without_masks()).solved())
+    assert raised.value.code == ErrorCode.CAMERAS_UNUSABLE
+    assert "camera-to-world" in raised.value.remedy
+
+
+def test_cameras_that_all_stand_in_one_place_are_told() -> None:
+    """Turned on the spot, far from the origin, where positions have few digits left."""
+    cameras = []
+    for camera in arc_cameras(4, 75, 80):
+        pose = camera.camera_from_world.copy()
+        pose[:3, 3] = -pose[:3, :3] @ [1e5, -2e5, 1e5]
+        cameras.append(replace(camera, camera_from_world=pose))
+    with pytest.raises(ReconstructionError, match="stand in one place") as raised:
+        region_of(without_images(cameras))
     assert raised.value.code == ErrorCode.CAMERAS_UNUSABLE
 
 

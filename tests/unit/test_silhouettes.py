@@ -152,6 +152,18 @@ def test_no_ray_misses_the_body_itself_and_all_miss_what_is_not_there() -> None:
     assert missing(rays, distance.abs() + 0.01).all()
 
 
+def test_a_mask_with_nothing_above_one_half_tells_no_width() -> None:
+    """Its photograph is passed over, and where all are such the region tells."""
+    scene = seen([-20.0, 0.0, 20.0], -0.5)
+    nothing = torch.full((SIZE, SIZE), 50.0)
+    scene.outlines[1] = nothing
+    one = explained_radius(scene)
+    assert math.isfinite(one)
+    scene.outlines[:] = [nothing] * 3
+    assert math.isfinite(explained_radius(scene))
+    assert ball_behind(scene, 0.3, NODES).isfinite().all()
+
+
 def test_no_ray_leaps_over_a_small_ball() -> None:
     """(|x - c|^2 - r^2) / 2r grows with |x|^2 / 2r: a step of its value would end far behind the ball."""
     scene = seen([-20.0, 0.0, 20.0], 0.3)

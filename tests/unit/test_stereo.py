@@ -203,6 +203,15 @@ def test_points_are_their_depth_maps() -> None:
         np.testing.assert_allclose(found.depth[at[:, 1], at[:, 0]] * OBJECT_UNIT, in_camera[:, 2], rtol=1e-4)
 
 
+def test_a_photograph_that_looks_away_takes_nothing_from_the_others() -> None:
+    first, second, third = scene().views
+    pose = np.diag([-1.0, 1.0, -1.0, 1.0]) @ second.camera.camera_from_world
+    away = replace(second, name="away", camera=replace(second.camera, camera_from_world=pose), mask=None)
+    with_it = match((first, second, away, third))
+    np.testing.assert_array_equal(with_it.points.positions, matched().points.positions)
+    assert not with_it.depth_maps[2].depth.any()
+
+
 def test_two_views_are_enough_and_are_trusted_less() -> None:
     pair = match(photographed(arc_cameras(2, 15, 160)).views)
     apart = errors_percent(pair)

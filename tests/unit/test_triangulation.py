@@ -49,3 +49,9 @@ def test_nearly_parallel_rays_are_none() -> None:
     a, b = camera_at(0.0), camera_at(0.02)
     _, good = two_view_points(a, b, pixels(a, POINTS), pixels(b, POINTS))
     assert not good.any()
+
+
+def test_cameras_in_one_place_see_no_point() -> None:
+    a = camera_at(0.0)
+    _, good = two_view_points(a, a, pixels(a, POINTS), np.add(pixels(a, POINTS), [3, 2]))
+    assert not good.any()
