@@ -22,9 +22,9 @@ from ..kernels.side_by_side import side_by_side
 from ..maths.metrics import (
     ErrorAgainstTruth,
     SurfaceError,
-    elsewhere_text,
     load_truth,
     psnr,
+    samples_worth_it,
     surface_error,
     vertex_error_percent,
 )
@@ -59,9 +59,6 @@ ERROR_MAP_LIMIT_PERCENT = 2.0
 
 Seen = TypeVar("Seen")
 Drawn = TypeVar("Drawn")
-
-_FEW_SAMPLES = 2000
-"""On either surface, where one does not lie where the other does."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -188,9 +185,7 @@ def build_report(inputs: ReportInputs, config: ReportConfig, *, progress: Progre
     drawn = mesh
     if truth is not None:
         progress(0.6, "measuring against the truth")
-        # all points of a surface far off are about equally near: each search takes a look at all of them
-        seed, is_near = inputs.seed, not elsewhere_text(mesh, truth)
-        num_samples = config.error_samples if is_near else min(_FEW_SAMPLES, config.error_samples)
+        seed, num_samples = inputs.seed, samples_worth_it(mesh, truth, config.error_samples)
         error = surface_error(mesh, truth, cameras=given, seed=seed, num_samples=num_samples)
         # The error takes the place of the support, which is drawn in colours from 0 to 1.
         distance = vertex_error_percent(mesh, truth, seed=seed, num_samples=num_samples)
