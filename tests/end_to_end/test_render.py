@@ -228,6 +228,20 @@ def test_stopped_nothing_is_left(folder: Path) -> None:
     assert not (folder / "pictures").exists()
 
 
+@pytest.mark.skipif(sys.platform == "win32", reason="pipes of POSIX")
+def test_a_reader_that_has_seen_enough_is_no_failure(folder: Path) -> None:
+    """As in `| head -1`: the pictures are there all the same."""
+    reader, writer = os.pipe()
+    os.close(reader)
+    options = ["--cameras", folder / "images" / "transforms.json", "--output", folder / "pictures"]
+    program = [sys.executable, "-m", "backend", "render", folder / "surface", *options]
+    run = subprocess.run(program, cwd=ROOT, stdout=writer, stderr=subprocess.PIPE, text=True, check=False)
+    os.close(writer)
+    assert run.returncode == 0, run.stderr
+    assert "Broken" not in run.stderr
+    assert (folder / "pictures" / "view_00.png").is_file()
+
+
 def test_on_the_wire_it_names_its_pictures(folder: Path) -> None:
     options = ["--cameras", folder / "images" / "transforms.json", "--output", folder / "pictures", "--wire"]
     with subprocess.Popen(
