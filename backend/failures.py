@@ -7,6 +7,9 @@ from .errors import ErrorCode, ReconstructionError
 _MEMORY_WORDS = ("out of memory", "not enough memory", "can't allocate memory", "cannot allocate memory")
 """What torch says on its CUDA, CPU (Windows and Linux) and MPS paths, in a plain RuntimeError."""
 
+_MISNAMED = (errno.ENAMETOOLONG, errno.EACCES)
+"""What paths say that are no paths, as a list of files in one word is none, or that are somebody else's."""
+
 
 def explain_or_none(error: Exception) -> ReconstructionError | None:
     """The failure as a ReconstructionError; None where it is a fault of the program."""
@@ -29,6 +32,12 @@ def explain_or_none(error: Exception) -> ReconstructionError | None:
             ErrorCode.DISK_FULL,
             "The disk is full.",
             "Free some space and start the same again.",
+        )
+    if isinstance(error, OSError) and error.errno in _MISNAMED and error.filename is not None:
+        return ReconstructionError(
+            ErrorCode.SETTINGS_INVALID,
+            f"{error.filename} cannot be looked at ({error.strerror}).",
+            "Check the path, and that you may use what is there.",
         )
     return None
 

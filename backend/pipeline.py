@@ -349,9 +349,8 @@ def _reconstructed(
     surface = this.stage("train", fit)
     extract = partial(stages.extract_mesh, views, region, stereo, surface, settings.mesh, originals=originals)
     mesh = this.stage("mesh", extract)
-    elsewhere = "" if truth is None else elsewhere_text(mesh, truth)
-    if elsewhere:
-        this.warn(elsewhere)
+    if truth is not None and (text := elsewhere_text(mesh, truth)):
+        this.warn(text)
     inputs = ReportInputs(
         job_name=job.output.resolve().name,
         settings=settings,
@@ -364,7 +363,6 @@ def _reconstructed(
         points=stereo.points,
         mesh=mesh,
         truth=truth,
-        truth_elsewhere=bool(elsewhere),
         versions=versions(),
     )
     return inputs, surface.radiance

@@ -1,5 +1,7 @@
 """Pictures of a finished job from any cameras: of its radiance field or, where it has none, of its mesh."""
 
+import os
+import re
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path, PurePosixPath
@@ -22,6 +24,8 @@ from .workspace import open_workspace
 
 Pixels = UInt8[np.ndarray, "height width channels"]
 Draw = Callable[[Camera, Progress], Pixels]
+_LONGEST_NAME = 255
+"""Of a file, in bytes, on the usual disks."""
 
 
 def render_job(job: Path, cameras: Path, output: Path, device: str, progress: Progress) -> tuple[str, ...]:
@@ -64,12 +68,28 @@ def _by_file_name(cameras: tuple[tuple[str, Camera], ...]) -> dict[str, Camera]:
     """Cameras by the names of their pictures."""
     named: dict[str, Camera] = {}
     for frame, camera in cameras:
-        name = PurePosixPath(frame.replace("\\", "/")).stem + ".png"
+        name = _file_name(frame)
         if name in named:
             text = f"Two of the cameras would be rendered to {name}."
             raise ReconstructionError(ErrorCode.CAMERAS_UNUSABLE, text, "Give each frame a name of its own.")
         named[name] = camera
     return named
+
+
+def _file_name(frame: str) -> str:
+    """Of a frame's picture: digits behind a dot are its number, not what it is written as."""
+    last = PurePosixPath(frame.replace("\\", "/")).name
+    name = re.sub(r"\.\D\w*$", "", last) + ".png"
+    try:
+        usable = name != ".png" and "\0" not in name and len(os.fsencode(name)) <= _LONGEST_NAME
+    except UnicodeEncodeError:  # half of a pair, which only JSON can tell
+        usable = False
+    if not usable:
+        text = f"No picture can be named after the frame {frame[:80]!r}."
+        raise ReconstructionError(
+            ErrorCode.CAMERAS_UNUSABLE, text, "Give it a shorter name of letters and digits."
+        )
+    return name
 
 
 def _drawing(job: Path, device_kind: str) -> Draw:

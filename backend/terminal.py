@@ -1,5 +1,6 @@
 """A run as a person sees it: a bar for each stage on a terminal, plain lines anywhere else."""
 
+import os
 import sys
 import time
 from collections.abc import Iterator
@@ -84,8 +85,12 @@ class TerminalListener:
         """Say where the results are and what they are worth."""
         self._stop_bars()
         lines = [*outcome.summary, *(str(output / name) for name in outcome.files)]
-        sys.stdout.write("".join(f"{line}\n" for line in lines))
-        sys.stdout.flush()
+        try:
+            sys.stdout.write("".join(f"{line}\n" for line in lines))
+            sys.stdout.flush()
+        except BrokenPipeError:
+            # Who read it has seen enough. Python would try once more at its end, and fail.
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
     def failed(self, error: ReconstructionError) -> None:
         """Say what went wrong and what to do."""

@@ -138,7 +138,6 @@ def finished_run(
         ),
         mesh=mesh,
         truth=None,
-        truth_elsewhere=False,
         versions={"FewView": "0.1.0", "torch": "2.13.0", "pycolmap": "4.2.1", "Python": "3.11"},
     )
 

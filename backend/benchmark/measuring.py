@@ -139,6 +139,15 @@ def runs_written(output: Path) -> tuple[Measurement, ...]:
         return ()
 
 
+def suite_written(output: Path) -> str | None:
+    """Name of the suite whose results.json is in the folder; None where there is none."""
+    try:
+        written = json.loads((output / "results.json").read_text(encoding="utf-8"))
+        return str(written["suite"]) if "runs" in written else None
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+
+
 def measure(
     trial: Trial, output: Path, *, inputs: str, program: tuple[str, ...], request: CancelRequest
 ) -> Measurement:

@@ -6,8 +6,10 @@ import platform
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 
+from ..held_files import when_let_go
 from ..machine import available_devices, usable_cores
 from . import plot
 from .measuring import Measurement
@@ -39,7 +41,10 @@ def write_results(output: Path, about: Mapping[str, object], runs: Sequence[Meas
         "runs": [asdict(run) for run in runs],
     }
     text = json.dumps(content, indent=2, allow_nan=False) + "\n"
-    (output / "results.json").write_text(text, encoding="utf-8")
+    # In one step: all that was measured before is known from this file alone.
+    part = output / "results.json.part"
+    part.write_text(text, encoding="utf-8")
+    when_let_go(partial(part.replace, output / "results.json"))
     (output / "table.md").write_text(tables(summaries), encoding="utf-8")
     plot.draw(output / "plot.svg", summaries)
 

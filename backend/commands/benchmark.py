@@ -7,14 +7,16 @@ from dataclasses import replace
 from datetime import UTC, datetime
 from itertools import product
 from pathlib import Path
+from tempfile import TemporaryFile
 from typing import TYPE_CHECKING
 
 from ..benchmark.suites import SUITES, Found, Suite, find_cases, with_budget
 from ..errors import ErrorCode, ReconstructionError
+from ..failures import output_unusable
 from ..wire.client import backend_command
 from ..wire.protocol import DEVICES, PRESETS
 from .argument_types import count, positive_seconds
-from .cancelling import CancelRequest, watch_signals
+from .cancelling import CancelRequest, catch_signals, watch_signals
 from .reconstruct import settle
 
 if TYPE_CHECKING:
@@ -73,14 +75,22 @@ def benchmark(parsed: argparse.Namespace, *, program: Sequence[str] | None = Non
 
 def _measure_all(parsed: argparse.Namespace, program: tuple[str, ...], request: CancelRequest) -> None:
     # Here, so that the other commands start without torch; and before hours of work, if one is missing.
-    from ..benchmark.measuring import Trial, inputs_of, measure, measured_before, measuring_fingerprint
+    from ..benchmark.measuring import (
+        Trial,
+        inputs_of,
+        measure,
+        measured_before,
+        measuring_fingerprint,
+        suite_written,
+    )
     from ..benchmark.record import write_record
     from ..benchmark.writing import machine_facts, write_results
     from ..machine import choose_device
 
+    catch_signals()
     suite = SUITES[parsed.suite]
     found = find_cases(_chosen(suite, parsed.cases), parsed.scenes, parsed.photos)
-    _check(parsed, found)
+    _check(parsed, found, suite_written(parsed.output))
     device = choose_device(parsed.device).type
     budgets_s = parsed.budgets if parsed.only_budgets else [None, *parsed.budgets]
     machine = machine_facts()
@@ -109,7 +119,7 @@ def _measure_all(parsed: argparse.Namespace, program: tuple[str, ...], request: 
 
     if runs:
         _say(f"Kept from before, as nothing that it depends on has changed: {len(runs)}.")
-        write()
+    write()  # of nothing, too: who is killed in the first run finds the folder begun
     for trial in trials:
         if trial not in runs:
             runs[trial] = measure(
@@ -151,8 +161,11 @@ def _asked(runs: Sequence["Measurement"]) -> dict[str, object]:
     }
 
 
-def _check(parsed: argparse.Namespace, found: Found) -> None:
-    """ReconstructionError where there is nothing to measure or no place for it."""
+def _check(parsed: argparse.Namespace, found: Found, begun: str | None) -> None:
+    """ReconstructionError where there is nothing to measure or no place for it.
+
+    `begun` is the suite that the output folder holds numbers of.
+    """
     if parsed.only_budgets and not parsed.budgets:
         raise ReconstructionError(
             ErrorCode.SETTINGS_INVALID,
@@ -166,14 +179,26 @@ def _check(parsed: argparse.Namespace, found: Found) -> None:
             "Run `make benchmark`, which renders the scenes, or give --scenes and --photos.",
         )
     output: Path = parsed.output
-    begun = (output / "results.json").is_file() and (output / "runs").is_dir()
-    if output.exists() and not begun and (not output.is_dir() or any(output.iterdir())):
-        raise ReconstructionError(
-            ErrorCode.OUTPUT_UNUSABLE,
-            f"{output} is neither an empty folder nor that of a benchmark.",
-            "Choose a new folder for --output.",
-        )
-    output.mkdir(parents=True, exist_ok=True)
+    for folder in filter(None, (output, parsed.record)):  # the record, too, before hours of work
+        _make_writable(folder)
+    text = ""
+    if begun is None and any(output.iterdir()):
+        text = f"{output} is neither an empty folder nor that of a benchmark."
+    elif begun not in (None, parsed.suite):
+        text = f"{output} holds the numbers of the suite {begun}, which would be lost."
+    if text:
+        remedy = "Choose a new folder for --output."
+        raise ReconstructionError(ErrorCode.OUTPUT_UNUSABLE, text, remedy)
+
+
+def _make_writable(folder: Path) -> None:
+    """Make the folder where it is missing; ReconstructionError(OUTPUT_UNUSABLE) where it takes no file."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        TemporaryFile(dir=folder).close()
+    except OSError as error:
+        text = f"{folder} cannot be written ({error.strerror or error})."
+        raise output_unusable(error, text, "Choose a folder that you may write to.") from error
 
 
 def _line(run: "Measurement") -> str:

@@ -56,7 +56,8 @@ def fit_points_command(parsed: argparse.Namespace) -> int:
 def _fit(parsed: argparse.Namespace, listener: "Listener") -> "Outcome":
     """Raises ReconstructionError for what the user can mend, and Cancelled; then nothing is written."""
     with packages_that_stay():
-        from ..maths.metrics import load_truth  # torch may be missing, and --help must still work
+        from .. import pipeline  # noqa: F401 - with pycolmap; torch may be missing, and --help must still work
+        from ..maths.metrics import load_truth
     from ..workspace import open_workspace
 
     catch_signals()
@@ -75,13 +76,14 @@ def _fit_into(
     import torch
 
     from ..machine import choose_device, set_up_torch
-    from ..maths.metrics import surface_error
+    from ..maths.metrics import elsewhere_text, samples_worth_it, surface_error
     from ..mesh_files import write_mesh
     from ..pipeline import Outcome
     from ..stages.mesh import MeshConfig
     from ..stages.point_cloud import read_cloud
     from ..stages.point_fit import PointFitConfig, fit_points
     from ..stages.point_mesh import mesh_of_points
+    from ..stages.report import ReportConfig
 
     device = choose_device(parsed.device, listener.warned)
     set_up_torch(device)
@@ -100,8 +102,11 @@ def _fit_into(
     seconds = time.perf_counter() - began_s
     error = None
     if truth is not None:
+        if text := elsewhere_text(mesh, truth):
+            listener.warned(text)
         listener.progressed(0.9, "comparing with the truth")
-        error = surface_error(mesh, truth, cameras=None, seed=parsed.seed)
+        num_samples = samples_worth_it(mesh, truth, ReportConfig().error_samples)
+        error = surface_error(mesh, truth, cameras=None, seed=parsed.seed, num_samples=num_samples)
     stages.end()
     report = _report(parsed, len(cloud.positions), mesh, seconds, error)
     text = json.dumps(report, indent=2) + "\n"

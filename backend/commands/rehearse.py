@@ -11,6 +11,7 @@ from functools import partial
 from pathlib import Path
 
 from ..errors import ErrorCode, ReconstructionError
+from ..failures import output_unusable
 from ..wire import protocol
 from ..wire.speaker import Speaker
 from . import rehearsed_files as files
@@ -39,9 +40,18 @@ def rehearse(output: Path | None, seconds: float = 1.0, *, end: str = "finished"
     )
 
 
+def _make(output: Path) -> None:
+    """The new folder; ReconstructionError(OUTPUT_UNUSABLE) where it is there already or cannot be."""
+    try:
+        output.mkdir(parents=True)
+    except OSError as error:
+        text = f"{output} cannot be made ({error.strerror or error})."
+        raise output_unusable(error, text, "Choose a new output folder.") from error
+
+
 def _play(output: Path | None, seconds: float, end: str, request: CancelRequest, speaking: Speaker) -> None:
     if output is not None:
-        output.mkdir(parents=True)
+        _make(output)
     stage_s = max(0.0, seconds) / len(_STAGES)
     for index, name in enumerate(_STAGES):
         speaking.say(protocol.Stage(name=name, index=index + 1, count=len(_STAGES)))

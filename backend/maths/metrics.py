@@ -42,6 +42,9 @@ READ_FAILURES = (
 _WORLD_FROM_GLTF = np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]], np.float64)
 """glTF has y up, the world of rendered views z up: as Blender's importer and our own mesh.glb have it."""
 
+_FEW_SAMPLES = 2000
+"""On either surface, where one does not lie where the other does."""
+
 _SCALE = 1.7
 """Times as large as the truth, or as small, what is no part of it and no hull around it any more."""
 
@@ -159,9 +162,15 @@ def elsewhere_text(mesh: SurfaceMesh, truth: TrueSurface) -> str:
         text = f"{apart / truth.diagonal:.2g} of its diagonals beside the mesh"
     else:
         return ""
-    return (
-        f"The true surface is {text}: errors say so, and nothing of the shape. Give it in the cameras' frame."
-    )
+    return f"The true surface is {text}: errors say so, and nothing of the shape. Give it in the same frame."
+
+
+def samples_worth_it(mesh: SurfaceMesh, truth: TrueSurface, wanted: int) -> int:
+    """How many samples the comparison takes: fewer than wanted where the truth lies elsewhere.
+
+    All points of a surface far off are about equally near: each search takes a look at all of them.
+    """
+    return min(_FEW_SAMPLES, wanted) if elsewhere_text(mesh, truth) else wanted
 
 
 def psnr(

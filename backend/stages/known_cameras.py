@@ -49,6 +49,8 @@ def read_cameras(given: Path) -> tuple[tuple[str, Camera], ...]:
     """
     source = _find_source(given)
     blanks = _blanks_of_model(source) if source.is_dir() else _blanks_of_transforms(source)
+    if not blanks:
+        raise _unusable(f"{source.name} holds no cameras.", "Export it again.")
     placed = read_placement(blanks, given).placed
     return tuple((blanks[one.index].name, undistorted_view(blanks[one.index], one).camera) for one in placed)
 

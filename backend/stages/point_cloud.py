@@ -1,5 +1,6 @@
 """A point cloud from a file, and what is wrong with it said at once."""
 
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -120,10 +121,13 @@ def _read_text(
     path: Path,
 ) -> tuple[Float64[np.ndarray, "points 3"], Float64[np.ndarray, "points 3"] | None]:
     """Numbers apart by blanks or commas; lines that begin with # say nothing. Raises ValueError."""
-    lines = path.read_text(encoding="utf-8-sig").replace(",", " ").splitlines()
-    if not any(line.strip() and not line.lstrip().startswith("#") for line in lines):
+    lines = path.read_text(encoding="utf-8-sig").splitlines()
+    first = next((line.split() for line in lines if line.strip() and not line.lstrip().startswith("#")), None)
+    if first is None:
         raise ValueError("it is empty")
-    table = np.loadtxt(lines, ndmin=2)
+    if len(first) > 1 and all(re.fullmatch(r"[^,]+,[^,]+", number) for number in first):
+        raise ValueError("it has commas where its numbers need points, such as 0,5 for 0.5")
+    table = np.loadtxt([line.replace(",", " ") for line in lines], ndmin=2)
     if table.shape[1] not in (3, 6):
         raise ValueError(f"it has {table.shape[1]} columns, not x y z or x y z nx ny nz")
     return table[:, :3], table[:, 3:] if table.shape[1] == 6 else None

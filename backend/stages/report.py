@@ -23,6 +23,7 @@ from ..maths.metrics import (
     SurfaceError,
     TrueSurface,
     psnr,
+    samples_worth_it,
     surface_error,
     vertex_error_percent,
 )
@@ -57,9 +58,6 @@ ERROR_MAP_LIMIT_PERCENT = 2.0
 
 Seen = TypeVar("Seen")
 Drawn = TypeVar("Drawn")
-
-_FEW_SAMPLES = 2000
-"""On either surface, where one does not lie where the other does."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -102,8 +100,6 @@ class ReportInputs:
     points: SurfacePoints
     mesh: SurfaceMesh
     truth: TrueSurface | None
-    truth_elsewhere: bool
-    """Whether it has another scale or place than the mesh."""
     versions: dict[str, str]
     """Program to version."""
 
@@ -184,9 +180,7 @@ def build_report(inputs: ReportInputs, config: ReportConfig, *, progress: Progre
     drawn = mesh
     if truth is not None:
         progress(0.6, "measuring against the truth")
-        # all points of a surface far off are about equally near: each search takes a look at all of them
-        most = _FEW_SAMPLES if inputs.truth_elsewhere else config.error_samples
-        seed, num_samples = inputs.seed, min(most, config.error_samples)
+        seed, num_samples = inputs.seed, samples_worth_it(mesh, truth, config.error_samples)
         error = surface_error(mesh, truth, cameras=given, seed=seed, num_samples=num_samples)
         # The error takes the place of the support, which is drawn in colours from 0 to 1.
         distance = vertex_error_percent(mesh, truth, seed=seed, num_samples=num_samples)

@@ -191,6 +191,15 @@ def rehearsal(call: str) -> subprocess.Popen[str]:
     return subprocess.Popen([sys.executable, "-S", "-c", script], cwd=ROOT, text=True, **pipes)
 
 
+def test_a_rehearsal_in_a_folder_that_is_there_is_refused(case: Case) -> None:
+    with rehearsal(f"__import__('pathlib').Path({str(case.photos)!r})") as process:
+        assert process.stdout is not None
+        last = messages(process.stdout.read())[-1]
+    assert process.returncode == 2
+    assert isinstance(last, Failed)
+    assert last.code == "output_unusable"
+
+
 def test_a_rehearsal_can_run_out_of_memory(case: Case) -> None:
     with rehearsal(f"__import__('pathlib').Path({str(case.output)!r}), 0.2, end='failed'") as process:
         assert process.stdout is not None

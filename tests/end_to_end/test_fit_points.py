@@ -103,8 +103,20 @@ def test_a_reconstruction_is_not_replaced(cloud: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+def test_a_truth_of_another_scale_is_told_in_seconds(cloud: Path, tmp_path: Path) -> None:
+    """As one in millimetres: all points of a sphere are equally far from its middle; none is found soon."""
+    truth = trimesh.creation.icosphere(subdivisions=4)
+    truth.apply_scale(1000)
+    truth.export(tmp_path / "truth.ply")
+    run = finished(cloud, "--output", tmp_path / "out", "--truth", tmp_path / "truth.ply")
+    assert run.returncode == 0, run.stderr
+    assert "Warning: The true surface is 1e+03 times as large as the mesh" in run.stderr
+
+
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX")
-def test_ctrl_c_leaves_nothing(cloud: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize("asked", [signal.SIGINT, signal.SIGTERM])
+def test_stopped_it_leaves_nothing(cloud: Path, tmp_path: Path, asked: signal.Signals) -> None:
     with subprocess.Popen(
         command(cloud, "--output", tmp_path / "out", "--method", "nap"), stderr=subprocess.PIPE, cwd=ROOT
     ) as process:
@@ -113,7 +125,7 @@ def test_ctrl_c_leaves_nothing(cloud: Path, tmp_path: Path) -> None:
             if b"points done" in line:
                 break
         time.sleep(1)
-        process.send_signal(signal.SIGINT)
+        process.send_signal(asked)
         process.stderr.read()
     assert process.returncode == 130
     assert not (tmp_path / "out").exists()

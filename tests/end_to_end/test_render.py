@@ -185,6 +185,35 @@ def test_two_frames_of_one_name_are_refused(folder: Path) -> None:
     assert "view_00.png" in error.text
 
 
+def named(folder: Path, *names: str) -> None:
+    """The frames get these names."""
+    path = folder / "images" / "transforms.json"
+    content = json.loads(path.read_text())
+    content["frames"] = [{**f, "file_path": n} for f, n in zip(content["frames"], names, strict=False)]
+    path.write_text(json.dumps(content))
+
+
+def test_a_number_behind_a_dot_belongs_to_the_name(folder: Path) -> None:
+    """As in the names of sequences, which many write without what they are written as."""
+    named(folder, "train/frame.0001", "train/frame.0002", "0.5.jpeg")
+    assert rendered(folder, "surface") == ("frame.0001.png", "frame.0002.png", "0.5.png")
+
+
+@pytest.mark.parametrize("name", ["", ".", "..", "a\0b", "x" * 300, "\ud800"])
+def test_a_name_that_no_file_can_have_is_told(name: str, folder: Path) -> None:
+    named(folder, "a", name)
+    error = refusal(folder, job="surface")
+    assert error.code is ErrorCode.CAMERAS_UNUSABLE
+    assert "No picture can be named" in error.text
+
+
+def test_a_file_without_cameras_is_told(folder: Path) -> None:
+    named(folder)
+    error = refusal(folder, job="surface")
+    assert error.code is ErrorCode.CAMERAS_UNUSABLE
+    assert error.text == "transforms.json holds no cameras."
+
+
 def test_stopped_nothing_is_left(folder: Path) -> None:
     told: list[float] = []
 
@@ -197,6 +226,20 @@ def test_stopped_nothing_is_left(folder: Path) -> None:
         render_job(folder / "nerf", folder / "images" / "transforms.json", folder / "pictures", "cpu", listen)
     assert told == sorted(told)
     assert not (folder / "pictures").exists()
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="pipes of POSIX")
+def test_a_reader_that_has_seen_enough_is_no_failure(folder: Path) -> None:
+    """As in `| head -1`: the pictures are there all the same."""
+    reader, writer = os.pipe()
+    os.close(reader)
+    options = ["--cameras", folder / "images" / "transforms.json", "--output", folder / "pictures"]
+    program = [sys.executable, "-m", "backend", "render", folder / "surface", *options]
+    run = subprocess.run(program, cwd=ROOT, stdout=writer, stderr=subprocess.PIPE, text=True, check=False)
+    os.close(writer)
+    assert run.returncode == 0, run.stderr
+    assert "Broken" not in run.stderr
+    assert (folder / "pictures" / "view_00.png").is_file()
 
 
 def test_on_the_wire_it_names_its_pictures(folder: Path) -> None:

@@ -1,7 +1,10 @@
 """The whole command with small stages in place of the real ones: what it runs, leaves and survives."""
 
+import errno
 import json
+import subprocess
 import sys
+import time
 from argparse import ArgumentParser, Namespace
 from dataclasses import replace
 from pathlib import Path
@@ -12,12 +15,13 @@ import torch
 from PIL import Image
 
 from backend import machine
-from backend.benchmark import suites
+from backend.benchmark import measuring, suites
 from backend.benchmark.measuring import measuring_fingerprint
-from backend.benchmark.suites import Case, Suite
+from backend.benchmark.suites import SUITES, Case, Suite
 from backend.commands import benchmark as command
 from backend.commands.cancelling import EXIT_CANCELLED, CancelRequest
 from backend.commands.reconstruct import EXIT_FINE, EXIT_USER_ERROR
+from backend.wire.client import ROOT
 
 # The small stages of the end-to-end tests; they must get the photographs that the case gives, and no others.
 PROGRAM = """
@@ -201,6 +205,86 @@ def test_a_folder_with_something_in_it_is_not_touched(
     assert command.benchmark(parsed(photos, output), program=fake_program()) == EXIT_USER_ERROR
     assert [path.name for path in output.iterdir()] == ["mine.txt"]
     assert "neither an empty folder" in capsys.readouterr().err
+
+
+def test_what_another_suite_gave_is_not_replaced(
+    photos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    output = tmp_path / "out"
+    words = parsed(photos, output, "--seeds", "1", "--presets", "fast")
+    assert command.benchmark(words, program=fake_program()) == EXIT_FINE
+    measured = (output / "results.json").read_bytes()
+    monkeypatch.setattr(command, "SUITES", {**command.SUITES, "quick": Suite(name="quick", cases=(CASE,))})
+    words.suite = "quick"
+    assert command.benchmark(words, program=fake_program()) == EXIT_USER_ERROR
+    assert "numbers of the suite toy" in capsys.readouterr().err
+    assert (output / "results.json").read_bytes() == measured
+
+
+@pytest.mark.parametrize("place", ["output", "record"])
+def test_a_place_that_cannot_be_written_is_told_before_the_work(
+    place: str, photos: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = parsed(photos, tmp_path / "out", "--seeds", "1", "--presets", "fast")
+    (tmp_path / "file").write_text("mine")
+    setattr(words, place, tmp_path / "file" / "within")
+    assert command.benchmark(words, program=fake_program()) == EXIT_USER_ERROR
+    assert "within cannot be written" in capsys.readouterr().err
+    assert not (tmp_path / "done").exists()
+
+
+def test_a_benchmark_that_was_killed_in_its_first_run_goes_on(
+    photos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def killed(_trial: object, output: Path, **_: object) -> None:
+        output.mkdir(parents=True)
+        raise SystemExit
+
+    words = parsed(photos, tmp_path / "out", "--seeds", "1", "--presets", "fast")
+    with monkeypatch.context() as patch:
+        patch.setattr(measuring, "measure", killed)
+        with pytest.raises(SystemExit):
+            command.benchmark(words, program=fake_program())
+    assert command.benchmark(words, program=fake_program()) == EXIT_FINE
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX")
+def test_a_polite_kill_ends_the_run_as_ctrl_c_does(tmp_path: Path) -> None:
+    """The libraries that measuring loads take that signal for themselves."""
+    folder = tmp_path / SUITES["photos"].cases[0].folder
+    for name in ("image", "mask"):
+        (folder / name).mkdir(parents=True)
+        for index in range(3):
+            Image.new("L", (8, 6)).save(folder / name / f"{index}.png")
+    (folder / "transforms.json").write_text('{"frames": []}')
+    words = ["--photos", tmp_path, "--seeds", "1", "--presets", "fast", "--output", tmp_path / "out"]
+    program = [sys.executable, "-m", "backend", "benchmark", "photos", *words]
+    with subprocess.Popen(program, cwd=ROOT, stderr=subprocess.PIPE, text=True) as process:
+        while process.poll() is None and not (tmp_path / "out" / "results.json").exists():
+            time.sleep(0.05)
+        time.sleep(0.5)
+        process.terminate()
+        assert process.stderr is not None
+        assert "Stopped; what was measured" in process.stderr.read()
+    assert process.returncode == EXIT_CANCELLED
+
+
+def test_a_failed_write_loses_no_numbers(
+    photos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As on a full disk: what was measured is still there."""
+    output = tmp_path / "out"
+    words = parsed(photos, output, "--seeds", "1", "--presets", "fast")
+    assert command.benchmark(words, program=fake_program()) == EXIT_FINE
+    measured, write = (output / "results.json").read_bytes(), Path.write_text
+
+    def full(path: Path, text: str, **options: str) -> int:
+        write(path, text[:10], **options)
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(Path, "write_text", full)
+    assert command.benchmark(words, program=fake_program()) == EXIT_USER_ERROR
+    assert (output / "results.json").read_bytes() == measured
 
 
 def test_a_benchmark_goes_on_where_it_was(

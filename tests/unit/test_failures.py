@@ -46,3 +46,18 @@ def test_no_promise_that_only_some_commands_keep(error: Exception) -> None:
     assert "kept" not in told.remedy
     assert "log.txt" not in told.remedy or "of a reconstruction" in told.remedy
     assert not OF_A_SHELL.search(told.remedy)
+
+
+def test_a_list_of_files_in_one_word_is_no_fault_of_the_program() -> None:
+    with pytest.raises(OSError, match="too long") as caught:
+        Path("a.jpg " * 50).is_file()
+    known = explain_or_none(caught.value)
+    assert known is not None
+    assert "a.jpg a.jpg" in known.text
+    assert "too long" in known.text
+
+
+def test_what_may_not_be_opened_is_named() -> None:
+    known = explain_or_none(PermissionError(errno.EACCES, "Permission denied", "theirs/cameras.json"))
+    assert known is not None
+    assert known.text == "theirs/cameras.json cannot be looked at (Permission denied)."

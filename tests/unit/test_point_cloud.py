@@ -141,3 +141,11 @@ def test_clouds_that_can_not_be_used(tmp_path: Path) -> None:
     broken = tmp_path / "cloud.ply"
     broken.write_bytes(b"ply\nformat ascii 1.0\nelement vertex 5\nproperty float x\nend_header\n")
     assert "cannot be read" in refusal(broken)
+
+
+def test_decimal_commas_do_not_make_more_columns(tmp_path: Path) -> None:
+    """A half of each number would be taken for the next coordinate, and the rest for normals."""
+    path = tmp_path / "cloud.txt"
+    rows = (" ".join(f"{100 * value:.3f}" for value in row) for row in some_points())
+    path.write_text("\n".join(rows).replace(".", ","))
+    assert "0,5 for 0.5" in refusal(path)

@@ -49,9 +49,10 @@ def surface_samples(count: int, seed: int = 0) -> np.ndarray:
 
 def without_images(cameras: list[Camera], **changes: object) -> SolvedCameras:
     """Solved views of cameras whose pictures do not matter: nothing in them stands alone."""
-    small = [replace(camera.resized(24, 18)) for camera in cameras]
-    scene: Scene = photographed(small, wall=True)
-    return replace(scene.without_masks().solved(), **changes)  # type: ignore[arg-type]
+    slope = np.broadcast_to(np.linspace(0, 1, 24, dtype=np.float32)[:, None], (18, 24, 3))
+    scene: Scene = photographed([camera.resized(24, 18) for camera in cameras]).without_masks()
+    views = tuple(replace(view, image_srgb=slope) for view in scene.views)
+    return replace(scene.solved(), views=views, **changes)  # type: ignore[arg-type]
 
 
 # from masks

@@ -363,8 +363,10 @@ def test_a_truth_of_another_scale_is_measured_by_few_samples(monkeypatch: pytest
         return measure(*args, num_samples=num_samples, **kwargs)
 
     monkeypatch.setattr(report, "surface_error", counted)
-    for elsewhere in (False, True):
-        build_report(replace(inputs, truth_elsewhere=elsewhere), SMALL, progress=no_progress)
+    assert inputs.truth is not None
+    larger = replace(inputs.truth, vertices=100 * inputs.truth.vertices)
+    for truth in (inputs.truth, larger):
+        build_report(replace(inputs, truth=truth), SMALL, progress=no_progress)
     assert asked == [SMALL.error_samples, 2000]
 
 
