@@ -41,6 +41,7 @@ from backend.wire.photographs import photographs_in
 class FakeStereo:
     points: SurfacePoints
     refined_cameras: tuple[Camera, ...] | None = None
+    beside_lines_px: None = None
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -134,7 +135,7 @@ def match_views(
         colours_srgb=ones,
         confidence=ones[:, 0],
         num_views=np.full(5, 2),
-        view_index=np.zeros(5, np.int64),
+        view_index=np.arange(5) % 2,
     )
     return FakeStereo(points=points)
 
