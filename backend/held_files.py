@@ -2,11 +2,15 @@
 
 import sys
 import time
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from functools import partial
+from pathlib import Path
 from typing import TypeVar
 
 T = TypeVar("T")
+PART = ".part"
+"""End of the name of a file that is being written."""
 _TRIES_S = (0.2, 0.5, 1.0, 2.0)
 """Waits between tries: on Windows a virus scanner holds new files for a moment."""
 
@@ -21,3 +25,11 @@ def when_let_go(move: Callable[[], T]) -> T:
             return move()
         time.sleep(wait_s)
     return move()
+
+
+@contextmanager
+def written_whole(path: Path) -> Iterator[Path]:
+    """A file beside the path, to write to; it takes the path's place in one step if nothing is raised."""
+    part = path.with_name(path.name + PART)
+    yield part
+    when_let_go(partial(part.replace, path))

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from .held_files import when_let_go
+from .held_files import written_whole
 
 T = typing.TypeVar("T")
 _STRUCTURE = "structure"
@@ -36,12 +36,10 @@ def save_record(path: Path, record: object, hint: object, *, note: str = "") -> 
     structure = json.dumps({"note": note, "record": _encode(record, hint, "record", arrays)})
     members = {f"array_{index}": array for index, array in enumerate(arrays)}
     members[_STRUCTURE] = np.frombuffer(structure.encode(), np.uint8)
-    part = path.with_name(path.name + ".part")
-    with part.open("wb") as file:
+    with written_whole(path) as part, part.open("wb") as file:
         np.savez(file, allow_pickle=False, **members)
         file.flush()
         os.fsync(file.fileno())
-    when_let_go(lambda: part.replace(path))
 
 
 def load_record(path: Path, hint: type[T]) -> T:

@@ -22,7 +22,7 @@ from typing import Any, Literal, TypeVar
 from .errors import ErrorCode, ReconstructionError
 from .failures import output_unusable
 from .file_lock import lock
-from .held_files import when_let_go
+from .held_files import PART, when_let_go, written_whole
 from .records import RecordUnreadable, load_record, read_note, save_record
 
 T = TypeVar("T")
@@ -220,10 +220,9 @@ class Workspace:
 
 def _write_format(private: Path, note: dict[str, Any]) -> None:
     """Write format.json whole or not at all; ReconstructionError(OUTPUT_UNUSABLE) where it cannot be."""
-    part = private / (_FORMAT_FILE + ".part")
     try:
-        part.write_text(json.dumps(note) + "\n", encoding="utf-8")
-        when_let_go(lambda: part.replace(private / _FORMAT_FILE))
+        with written_whole(private / _FORMAT_FILE) as part:
+            part.write_text(json.dumps(note) + "\n", encoding="utf-8")
     except OSError as error:
         raise _not_writable(private.parent, error) from error
 
@@ -306,7 +305,7 @@ def _check_ours(folder: Path) -> None:
     private = folder / PRIVATE
     marker = private / _FORMAT_FILE
     unmarked = set() if not private.is_dir() else {entry.name for entry in private.iterdir()}
-    if not names or (names == [PRIVATE] and unmarked <= {_LOCK, _FORMAT_FILE + ".part"}):
+    if not names or (names == [PRIVATE] and unmarked <= {_LOCK, _FORMAT_FILE + PART}):
         return
     if not marker.is_file():
         shown = ", ".join(names[:3]) + (", ..." if len(names) > 3 else "")

@@ -6,10 +6,9 @@ import platform
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
-from functools import partial
 from pathlib import Path
 
-from ..held_files import when_let_go
+from ..held_files import written_whole
 from ..machine import available_devices, usable_cores
 from . import plot
 from .measuring import Measurement
@@ -42,9 +41,8 @@ def write_results(output: Path, about: Mapping[str, object], runs: Sequence[Meas
     }
     text = json.dumps(content, indent=2, allow_nan=False) + "\n"
     # In one step: all that was measured before is known from this file alone.
-    part = output / "results.json.part"
-    part.write_text(text, encoding="utf-8")
-    when_let_go(partial(part.replace, output / "results.json"))
+    with written_whole(output / "results.json") as part:
+        part.write_text(text, encoding="utf-8")
     (output / "table.md").write_text(tables(summaries), encoding="utf-8")
     plot.draw(output / "plot.svg", summaries)
 

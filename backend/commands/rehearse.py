@@ -12,6 +12,7 @@ from pathlib import Path
 
 from ..errors import ErrorCode, ReconstructionError
 from ..failures import output_unusable
+from ..held_files import written_whole
 from ..wire import protocol
 from ..wire.speaker import Speaker
 from . import rehearsed_files as files
@@ -103,7 +104,7 @@ def _write_results(output: Path) -> tuple[str, ...]:
 
 
 def _put(path: Path, write: Callable[[Path], object]) -> Path:
-    """Write under another name first, so that nobody reads half a file; the path."""
-    part = path.with_name(path.name + ".part")
-    write(part)
-    return part.replace(path)
+    """Write so that nobody reads half a file; the path."""
+    with written_whole(path) as part:
+        write(part)
+    return path

@@ -1,7 +1,8 @@
-"""Connected pieces: of a mesh by its edges, of a depth map by neighbouring pixels."""
+"""Connected pieces: of a mesh by its edges, of a depth map or a picture by neighbouring pixels."""
 
 import numpy as np
-from jaxtyping import Int, Int64
+from jaxtyping import Bool, Int, Int32, Int64
+from scipy.ndimage import label
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
@@ -11,3 +12,11 @@ def connected_pieces(pairs: Int[np.ndarray, "2 pairs"], count: int) -> Int64[np.
     links = coo_array((np.ones(pairs.shape[1], bool), pairs), shape=(count, count))
     _, piece = connected_components(links, directed=False)
     return np.asarray(piece, np.int64)
+
+
+def whole_pieces(pixels: Bool[np.ndarray, "height width"]) -> Int32[np.ndarray, "height width"]:
+    """A number for each piece of the pixels that are set; 0 off them, and in pieces that the border cuts."""
+    pieces, _ = label(pixels)
+    at_border = np.concatenate([pieces[0], pieces[-1], pieces[:, 0], pieces[:, -1]])
+    whole: Int32[np.ndarray, "height width"] = np.where(np.isin(pieces, at_border), 0, pieces)
+    return whole

@@ -9,8 +9,9 @@ from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Float64
-from scipy.ndimage import binary_erosion, label, sum_labels
+from scipy.ndimage import binary_erosion, sum_labels
 
+from ..maths.pieces import whole_pieces
 from ..maths.projection import projected, shown
 from ..scene import Camera, DepthMap, Region, SurfacePoints, View, transform_points
 from .measurements import SURE
@@ -39,9 +40,8 @@ def _without_covered(
 ) -> DepthMap:
     if map_.empty is None:
         return map_
-    patches, count = label(map_.empty)
-    at_border = np.concatenate([patches[0], patches[-1], patches[:, 0], patches[:, -1]])
-    enclosed = np.setdiff1d(np.arange(1, count + 1), at_border)
+    patches = whole_pieces(map_.empty)
+    enclosed = np.unique(patches[patches > 0])
     if not len(enclosed):
         return map_
     pixels, depth = projected(others_world, camera)

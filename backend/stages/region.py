@@ -92,14 +92,15 @@ def find_region(solved: SolvedCameras, config: RegionConfig, *, progress: Progre
         if radius <= 0:
             raise _looking_apart(solved.views, centre)
         choice, because = "what all cameras look at", "neither masks nor triangulated points"
-    alone = standing_alone(solved.views)
-    if len(alone) >= 2 and (cut_off := share_cut_off(alone, centre, radius)) > _CUT_OFF:
+    found, alone = _region(centre, radius, choice, because), standing_alone(solved.views)
+    if len(alone) >= 2 and (cut_off := share_cut_off(alone, found)) > _CUT_OFF:
         with suppress(ReconstructionError):  # what each shows may be another thing
             hull_centre, hull_radius, _ = _of_masks(alone, config)
             centre, radius = around_both((centre, radius), (hull_centre, hull_radius))
             choice += ", and what stands alone before an even backdrop"
             because += f", which leave out {cut_off:.0%} of what {len(alone)} photographs show whole"
-    return _region(centre, radius, choice, because)
+            found = _region(centre, radius, choice, because)
+    return found
 
 
 def around_both(

@@ -7,12 +7,13 @@ from dataclasses import replace
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float64
-from scipy.ndimage import label
+from jaxtyping import Bool
 
 from ..maths.backdrop import find_backdrop
-from ..maths.raycast import camera_rays
-from ..scene import View
+from ..maths.geometry import pinhole_in_object
+from ..maths.pieces import whole_pieces
+from ..scene import Region, View
+from .stereo_windows import sees_region
 
 _LEAST_SHARE = 0.002
 """Of the picture: less is no subject."""
@@ -31,20 +32,16 @@ def _whole_before_backdrop(view: View) -> Bool[np.ndarray, "height width"]:
     backdrop = find_backdrop(colours, everywhere)
     if backdrop is None:
         return np.zeros(colours.shape[1:], np.bool_)
-    pieces, _ = label(backdrop.subject.numpy())
-    at_border = np.concatenate([pieces[0], pieces[-1], pieces[:, 0], pieces[:, -1]])
-    whole: Bool[np.ndarray, "height width"] = ~np.isin(pieces, np.append(at_border, 0))
+    whole: Bool[np.ndarray, "height width"] = whole_pieces(backdrop.subject.numpy()) > 0
     return whole
 
 
-def share_cut_off(views: list[View], centre: Float64[np.ndarray, "3"], radius: float) -> float:
-    """Of what a mask shows, in the worst view, the share whose rays pass beside a sphere (world frame)."""
-    return max((_passing(view, centre, radius) for view in views), default=0.0)
+def share_cut_off(views: list[View], region: Region) -> float:
+    """Of what a mask shows, in the worst view, the share whose rays pass beside the region."""
+    return max((_passing(view, region) for view in views), default=0.0)
 
 
-def _passing(view: View, centre: Float64[np.ndarray, "3"], radius: float) -> float:
+def _passing(view: View, region: Region) -> float:
     assert view.mask is not None
-    _, directions = camera_rays(view.camera)
-    to_centre = centre - view.camera.position
-    nearest = np.linalg.norm(np.cross(directions, to_centre), axis=-1).reshape(view.mask.shape)
-    return float((nearest[view.mask > 0.5] > radius).mean())
+    meets = sees_region(pinhole_in_object(view.camera, region, torch.device("cpu"))).numpy()
+    return float(1 - meets[view.mask > 0.5].mean())

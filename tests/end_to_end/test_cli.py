@@ -191,22 +191,24 @@ def rehearsal(call: str) -> subprocess.Popen[str]:
     return subprocess.Popen([sys.executable, "-S", "-c", script], cwd=ROOT, text=True, **pipes)
 
 
-def test_a_rehearsal_in_a_folder_that_is_there_is_refused(case: Case) -> None:
-    with rehearsal(f"__import__('pathlib').Path({str(case.photos)!r})") as process:
+def failed_rehearsal(call: str) -> Failed:
+    """How it ends."""
+    with rehearsal(call) as process:
         assert process.stdout is not None
         last = messages(process.stdout.read())[-1]
     assert process.returncode == 2
     assert isinstance(last, Failed)
-    assert last.code == "output_unusable"
+    return last
+
+
+def test_a_rehearsal_in_a_folder_that_is_there_is_refused(case: Case) -> None:
+    failed = failed_rehearsal(f"__import__('pathlib').Path({str(case.photos)!r})")
+    assert failed.code == "output_unusable"
 
 
 def test_a_rehearsal_can_run_out_of_memory(case: Case) -> None:
-    with rehearsal(f"__import__('pathlib').Path({str(case.output)!r}), 0.2, end='failed'") as process:
-        assert process.stdout is not None
-        last = messages(process.stdout.read())[-1]
-    assert process.returncode == 2
-    assert isinstance(last, Failed)
-    assert last.code == "out_of_memory"
+    failed = failed_rehearsal(f"__import__('pathlib').Path({str(case.output)!r}), 0.2, end='failed'")
+    assert failed.code == "out_of_memory"
     assert not (case.output / "mesh.ply").exists()
 
 
