@@ -18,6 +18,7 @@ from .job_folder import RESULT, folder_for
 from .operators.environment import backend_python_or_reason
 from .operators.reconstruct import start
 from .properties import settings_of
+from .scenes import reason_against_changes
 
 
 class ReconstructionFailed(RuntimeError):  # noqa: N818 - it says what happened
@@ -58,7 +59,8 @@ def reconstruct(
     arguments that make no sense, ReconstructionFailed where the backend gives up.
     """
     python, reason = backend_python_or_reason(bpy.context)
-    if python is None:
+    reason = reason_against_changes(bpy.context.scene) or reason
+    if python is None or reason:
         raise jobs.JobError(reason)
     asked = Job(
         protocol=PROTOCOL_VERSION,

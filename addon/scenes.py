@@ -1,6 +1,19 @@
-"""Scenes and objects found again, after the user has had time to rename, delete or undo."""
+"""Scenes that can be worked on; they and objects found again, after the user had time to rename or delete."""
+
+from pathlib import Path
 
 import bpy
+
+
+def reason_against_changes(scene: bpy.types.Scene) -> str:
+    """Why nothing can be put into the scene; empty where something can."""
+    if scene.library is None:
+        return ""
+    file = Path(scene.library.filepath).name
+    return (
+        f"The scene {scene.name} is linked from {file} and takes no new objects: make it local by the chain "
+        "beside its name at the top of the window, or append it instead"
+    )
 
 
 def scene_named(name: str) -> bpy.types.Scene:

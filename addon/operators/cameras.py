@@ -14,7 +14,7 @@ from .. import camera_objects, jobs, undo_step
 from ..arguments import absolute, argument, fill_in
 from ..job_folder import LOG, RESULT, FolderError, folder_for, read_job_file, write_job
 from ..properties import IN_BLEND, settings_of
-from ..scenes import scene_name_of, scene_named
+from ..scenes import reason_against_changes, scene_name_of, scene_named
 from .environment import backend_python_or_reason
 from .images import used_images
 from .reconstruct import jobs_parent
@@ -42,7 +42,10 @@ class FEWVIEW_OT_estimate_cameras(bpy.types.Operator):
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        """A backend, and no other job."""
+        """A backend, no other job, and a scene that takes the cameras."""
+        if reason := reason_against_changes(context.scene):
+            cls.poll_message_set(reason)
+            return False
         if jobs.running() is not None:
             cls.poll_message_set("Wait for the running job, or cancel it")
             return False
@@ -110,6 +113,14 @@ class FEWVIEW_OT_import_cameras(bpy.types.Operator):
         subtype="DIR_PATH",
         options={"SKIP_SAVE", *IN_BLEND},
     )
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        """A scene that takes them."""
+        reason = reason_against_changes(context.scene)
+        if reason:
+            cls.poll_message_set(reason)
+        return not reason
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         """Import all at once."""

@@ -13,7 +13,7 @@ from ..object_points import points_of, reason_against
 from ..ply import write_points
 from ..properties import settings_of
 from ..result_import import import_fit_steps
-from ..scenes import scene_name_of
+from ..scenes import reason_against_changes, scene_name_of
 from .environment import backend_python_or_reason, reason_against_a_job
 from .reconstruct import IN_PAST_JOBS, jobs_parent
 
@@ -33,8 +33,8 @@ class FEWVIEW_OT_fit_points(bpy.types.Operator):
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        """Not twice at once, not without a backend, and not without points."""
-        reason = reason_against_a_job(context)
+        """Not twice at once, not without a backend, points, and a scene that takes the surface."""
+        reason = reason_against_changes(context.scene) or reason_against_a_job(context)
         if not reason and context.mode != "OBJECT":
             reason = "Change to Object Mode first"
         reason = reason or reason_against(context.active_object)

@@ -28,7 +28,7 @@ from ..properties import FEWVIEW_PG_settings, settings_of
 from ..region import region_of
 from ..report_text import report_text
 from ..result_import import import_result_steps, show_estimated_cameras
-from ..scenes import scene_name_of, scene_named
+from ..scenes import reason_against_changes, scene_name_of, scene_named
 from ..solved import read_solved
 from ..state_lines import FEWEST_IMAGES
 from .environment import backend_python_or_reason, reason_against_a_job
@@ -114,8 +114,8 @@ class FEWVIEW_OT_reconstruct(bpy.types.Operator):
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        """Not twice at once, and not without a backend."""
-        reason = reason_against_a_job(context)
+        """Not twice at once, not without a backend, and not into a scene that takes no mesh."""
+        reason = reason_against_changes(context.scene) or reason_against_a_job(context)
         if reason:
             cls.poll_message_set(reason)
         return not reason

@@ -8,6 +8,7 @@ from bpy.props import FloatProperty, FloatVectorProperty
 
 from .. import region
 from ..mesh_import import select_alone
+from ..scenes import reason_against_changes
 from .on_result import Status
 
 
@@ -31,10 +32,12 @@ class FEWVIEW_OT_add_region(bpy.types.Operator):
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        if region.region_or_none(context.scene) is not None:
-            cls.poll_message_set("There is a region already: scale it, or fit it")
-            return False
-        return True
+        reason = reason_against_changes(context.scene)
+        if not reason and region.region_or_none(context.scene) is not None:
+            reason = "There is a region already: scale it, or fit it"
+        if reason:
+            cls.poll_message_set(reason)
+        return not reason
 
     def execute(self, context: bpy.types.Context) -> Status:
         sphere, source = region.guess(context.scene)
@@ -52,6 +55,13 @@ class FEWVIEW_OT_fit_region(bpy.types.Operator):
     bl_idname = "fewview.fit_region"
     bl_label = "Fit Region"
     bl_options: ClassVar = {"REGISTER", "UNDO"}
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        reason = reason_against_changes(context.scene)
+        if reason:
+            cls.poll_message_set(reason)
+        return not reason
 
     def execute(self, context: bpy.types.Context) -> Status:
         try:

@@ -12,6 +12,7 @@ from ..job_folder import FolderError, past_jobs
 from ..properties import IN_BLEND, settings_of
 from ..result_import import import_result_steps
 from ..result_mesh import result_or_none
+from ..scenes import reason_against_changes
 from .measure import FEWVIEW_OT_measure_error
 from .on_result import OnResult, Status, has_result, refused, result_of
 from .reconstruct import jobs_parent
@@ -43,10 +44,12 @@ class FEWVIEW_OT_import_result(bpy.types.Operator):
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        if context.mode != "OBJECT":
-            cls.poll_message_set("Change to Object Mode first")
-            return False
-        return True
+        reason = reason_against_changes(context.scene)
+        if not reason and context.mode != "OBJECT":
+            reason = "Change to Object Mode first"
+        if reason:
+            cls.poll_message_set(reason)
+        return not reason
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> Status:
         if self.folder:

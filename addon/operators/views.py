@@ -14,7 +14,7 @@ from ..arguments import argument, fill_in
 from ..camera_objects import selected_cameras
 from ..job_folder import new_folder
 from ..properties import FEWVIEW_PG_settings, settings_of
-from ..scenes import in_scene, object_named, scene_name_of, scene_named
+from ..scenes import in_scene, object_named, reason_against_changes, scene_name_of, scene_named
 from ..solved import read_solved
 from ..true_mesh import WITH_SURFACE
 from ..view_cameras import ViewPlan
@@ -48,7 +48,10 @@ class FEWVIEW_OT_generate_views(bpy.types.Operator):
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        """There must be something to look at."""
+        """There must be something to look at, in a scene that takes cameras."""
+        if reason := reason_against_changes(context.scene):
+            cls.poll_message_set(reason)
+            return False
         if not any(made.type in WITH_SURFACE or made.type == "EMPTY" for made in context.scene.objects):
             cls.poll_message_set("Add an object to look at")
             return False

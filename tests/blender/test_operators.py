@@ -99,12 +99,25 @@ class Situation:
     def region(self) -> None:
         assert bpy.ops.fewview.add_region() == {"FINISHED"}
 
+    def linked_scene(self) -> None:
+        """A scene of another file, with something to look at."""
+        self.result()
+        own, path = bpy.context.scene, str(self.folder / "other.blend")
+        bpy.data.libraries.write(path, {own})
+        with bpy.data.libraries.load(path, link=True) as (given, wanted):
+            wanted.scenes = given.scenes
+        bpy.context.window.scene = next(made for made in bpy.data.scenes if made != own)
+
     def made_environment(self) -> None:
         self.patch.setattr(self.part("environment"), "can_be_removed", lambda _: True)
         self.running()
 
 
 ON_RESULT = ((Situation.nothing, "Reconstruct first"), (Situation.editing, "Object Mode"))
+NEEDS_OWN_SCENE = (
+    Situation.linked_scene,
+    "is linked from other.blend and takes no new objects: make it local",
+)
 NEEDS_BACKEND = (
     (Situation.no_backend, "press Set Up FewView"),
     (Situation.wrong_backend, "is not there"),
@@ -112,7 +125,7 @@ NEEDS_BACKEND = (
 
 OPERATORS = {
     "add_images": Expected(undo=True),
-    "add_region": Expected(undo=True, grey=((Situation.region, "a region already"),)),
+    "add_region": Expected(undo=True, grey=((Situation.region, "a region already"), NEEDS_OWN_SCENE)),
     "cancel": Expected(
         undo=False,
         grey=((Situation.nothing, "Nothing is running"), (Situation.cancelling, "stopping already")),
@@ -123,9 +136,11 @@ OPERATORS = {
     "copy_report": Expected(undo=False),
     "decimate": Expected(undo=True, grey=ON_RESULT),
     "dismiss": Expected(undo=False),
-    "estimate_cameras": Expected(undo=False, grey=((Situation.running, "Wait for"), *NEEDS_BACKEND)),
+    "estimate_cameras": Expected(
+        undo=False, grey=((Situation.running, "Wait for"), *NEEDS_BACKEND, NEEDS_OWN_SCENE)
+    ),
     "export": Expected(undo=False, grey=ON_RESULT),
-    "fit_region": Expected(undo=True),
+    "fit_region": Expected(undo=True, grey=(NEEDS_OWN_SCENE,)),
     "fit_points": Expected(
         undo=False,
         grey=(
@@ -134,11 +149,12 @@ OPERATORS = {
             (Situation.some_backend, "Select a mesh or a point cloud"),
             (Situation.few_points, "Only 3 points"),
             (Situation.editing_points, "Object Mode"),
+            NEEDS_OWN_SCENE,
         ),
     ),
-    "generate_views": Expected(undo=True, grey=((Situation.nothing, "Add an object"),)),
-    "import_cameras": Expected(undo=True),
-    "import_result": Expected(undo=True, grey=((Situation.editing, "Object Mode"),)),
+    "generate_views": Expected(undo=True, grey=((Situation.nothing, "Add an object"), NEEDS_OWN_SCENE)),
+    "import_cameras": Expected(undo=True, grey=(NEEDS_OWN_SCENE,)),
+    "import_result": Expected(undo=True, grey=((Situation.editing, "Object Mode"), NEEDS_OWN_SCENE)),
     "install_backend": Expected(
         undo=False,
         grey=((Situation.offline, "Allow Online Access"), (Situation.online_and_running, "Wait until")),
@@ -147,7 +163,9 @@ OPERATORS = {
     "open_camera_report": Expected(undo=False, grey=((Situation.nothing, "Estimate the cameras"),)),
     "open_folder": Expected(undo=False),
     "open_report": Expected(undo=False),
-    "reconstruct": Expected(undo=False, grey=((Situation.running, "still running"), *NEEDS_BACKEND)),
+    "reconstruct": Expected(
+        undo=False, grey=((Situation.running, "still running"), *NEEDS_BACKEND, NEEDS_OWN_SCENE)
+    ),
     "remesh": Expected(undo=True, grey=ON_RESULT),
     "remove_backend": Expected(
         undo=False,
@@ -323,6 +341,17 @@ def test_a_greyed_button_says_why(situation: Situation, name: str, into: Set, wo
     assert words in reason
     assert reason[0].isupper() or reason[0] == "/"
     assert not reason.endswith(".")
+
+
+def test_a_linked_scene_that_was_made_local_is_as_any_other(situation: Situation) -> None:
+    situation.linked_scene()
+    api = situation.part("api")
+    with pytest.raises(situation.part("jobs").JobError, match="is linked from"):
+        api.reconstruct([situation.folder], output=situation.folder)
+    bpy.context.scene.make_local()
+    assert bpy.ops.fewview.add_region() == {"FINISHED"}
+    bpy.context.view_layer.objects.active = bpy.context.scene.fewview.result
+    assert bpy.ops.fewview.generate_views(view_count=2) == {"FINISHED"}
 
 
 # The list of photographs.
