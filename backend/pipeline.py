@@ -335,7 +335,7 @@ def _reconstructed(
     previews.show_cameras(solved, region)
     match = partial(stages.match_views, solved, region, settings.stereo, device=device)
     stereo = this.stage("stereo", match)
-    if settings.stereo is not None and (lack := hollows_filled(stereo)):
+    if settings.stereo is not None and (lack := hollows_filled(stereo, region)):
         this.warn(lack)
     for doubt in disagreement(solved, stereo):
         this.warn(doubt)

@@ -172,6 +172,8 @@ class Region:
 
     object_from_world: Float64[np.ndarray, "4 4"]
     """A similarity: uniform scale, rotation, translation."""
+    given: bool = False
+    """By the user, rather than found."""
     decisions: tuple[Decision, ...] = ()
     doubt: str | None = None
     """For a person: what speaks against it, and what helps; None if nothing does."""

@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 from ..errors import ErrorCode, ReconstructionError
-from ..scene import Decision, DepthMap, StereoResult, SurfacePoints, View
+from ..scene import Decision, DepthMap, Region, StereoResult, SurfacePoints, View
 
 FEWEST_POINTS = 100
 """With fewer, what agreed did so by chance."""
@@ -17,9 +17,12 @@ FEWEST_OUTLINES = 3
 """Two leave a box."""
 _MOST_OF_EDGE = 0.5
 """Of a picture's edge that may show the subject: more is a mask of what is around it."""
+_OTHER_REGION = (
+    "Give a larger region in the frame of the cameras, or leave it out. Where it does hold the subject: "
+)
 
 
-def check_enough(points: SurfacePoints, views: tuple[View, ...]) -> None:
+def check_enough(points: SurfacePoints, views: tuple[View, ...], region: Region) -> None:
     """Raises ReconstructionError(NO_SURFACE) where neither points nor outlines tell the shape."""
     told = sum(map(_shows_outline, views)) >= FEWEST_OUTLINES
     if told or len(points.positions) >= FEWEST_POINTS:
@@ -28,10 +31,20 @@ def check_enough(points: SurfacePoints, views: tuple[View, ...]) -> None:
     about_masks = " Check that the masks are white on the subject and belong to these photographs."
     raise ReconstructionError(
         ErrorCode.NO_SURFACE,
-        f"The photographs agree on only {len(points.positions)} points of the surface.",
-        "Take photographs that overlap by more than half, sharp and evenly lit; shiny, transparent "
-        "or plain surfaces need masks, or some texture such as dust or chalk." + about_masks * masked,
+        f"{_agreement(region)} only {len(points.positions)} points of the surface.",
+        f"{_OTHER_REGION * region.given}"
+        "Take photographs that overlap by more than half, sharp and evenly lit; shiny, transparent or plain surfaces need masks, or some texture such as dust or chalk."
+        f"{about_masks * masked}",
     )
+
+
+def _agreement(region: Region) -> str:
+    """The beginning of a sentence that ends in how little it is: a region of the user's may be to blame."""
+    if not region.given:
+        return "The photographs agree on"
+    where = ", ".join(f"{value:g}" for value in region.centre_world)
+    sphere = f"of radius {region.radius_world:g} around ({where})"
+    return f"In the region that was given, {sphere}, the photographs agree on"
 
 
 def _shows_outline(view: View) -> bool:
@@ -71,12 +84,12 @@ def _unmeasured(map_: DepthMap) -> DepthMap:
     return replace(map_, depth=np.zeros_like(map_.depth), confidence=np.zeros_like(map_.confidence))
 
 
-def hollows_filled(stereo: StereoResult) -> str | None:
+def hollows_filled(stereo: StereoResult, region: Region) -> str | None:
     """For a person, where photographs were compared: what the shape lacks, and what helps; else None."""
     if len(stereo.points.positions):
         return None
     return (
-        "The photographs agree on next to nothing, so the shape comes from the outlines of the masks alone: "
-        "hollows are filled, and what no outline shows is a guess. Photographs 10 to 20 degrees apart, or "
-        "some texture such as dust or chalk, would show more."
+        f"{_agreement(region)} next to nothing, so the shape comes from the outlines of the masks alone: "
+        f"hollows are filled, and what no outline shows is a guess. {_OTHER_REGION * region.given}"
+        "Photographs 10 to 20 degrees apart, or some texture such as dust or chalk, would show more."
     )

@@ -69,7 +69,7 @@ def find_region(solved: SolvedCameras, config: RegionConfig, *, progress: Progre
     if config.centre_world is not None and config.radius_world is not None:
         centre = np.array(config.centre_world)
         _check_shown(centre, config.radius_world, [view.camera for view in solved.views])
-        return _region(centre, config.radius_world, "as given", "set by the user")
+        return replace(_region(centre, config.radius_world, "as given", "set by the user"), given=True)
     masked = [view for view in solved.views if view.mask is not None]
     if len(masked) >= 2:
         centre, radius, doubt = _of_masks(masked, config)

@@ -46,7 +46,7 @@ def match_views(
         nearby = neighbours([sizes[0].camera for sizes in pyramids], config.num_sources)
         sizes = depth_maps(pyramids, nearby, config, within(progress, 0.0, 0.95))
         points = _points(views, sizes, config)
-    check_enough(points, views)
+    check_enough(points, views, region)
     full_size = tuple(_full_size(view, maps, region, config) for view, maps in zip(views, sizes, strict=True))
     full_size = without_covered_patches(full_size, points, views, region)
     found = StereoResult(points=points, depth_maps=full_size)

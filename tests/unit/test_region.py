@@ -423,6 +423,7 @@ def test_a_given_sphere_is_taken() -> None:
     np.testing.assert_allclose(region.centre_world, [1, 2, 3])
     assert region.radius_world == pytest.approx(4.0)
     assert region.decisions[0].because == "set by the user"
+    assert region.given
 
 
 def test_a_given_sphere_that_no_photograph_shows_is_told() -> None:

@@ -2,17 +2,18 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 
 import numpy as np
 import pytest
 import torch
+from jaxtyping import Float64
 from scipy.ndimage import distance_transform_edt, gaussian_filter
 
 from backend.errors import Cancelled, ErrorCode, ReconstructionError
 from backend.maths.geometry import Pinhole, pinhole_in_object
 from backend.maths.raycast import camera_rays
-from backend.scene import Camera, Region, StereoResult, View, no_progress, transform_points
+from backend.scene import Camera, Region, StereoResult, View, no_progress, to_unit_sphere, transform_points
 from backend.stages.depth_maps import depth_maps
 from backend.stages.outlines_alone import hollows_filled
 from backend.stages.stereo import match_views
@@ -28,6 +29,7 @@ from tests.synthetic_scene import (
     diagonal,
     photographed,
     surface_distance,
+    surface_points,
     texture_srgb,
     true_normals,
     true_region,
@@ -463,7 +465,7 @@ def test_a_masked_subject_without_texture_has_no_points(noisy: bool) -> None:
     assert not len(result.points.positions)
     assert not any(map_.depth.any() or map_.confidence.any() for map_ in result.depth_maps)
     assert "outlines" in result.decisions[0].choice
-    assert "outlines" in (hollows_filled(result) or "")
+    assert "outlines" in (hollows_filled(result, true_region()) or "")
     two_masks = (*views[:2], replace(views[2], mask=None))
     of_all_else = tuple(replace(view, mask=1 - view.mask) for view in views if view.mask is not None)
     for without_outlines in (two_masks, of_all_else):
@@ -471,6 +473,19 @@ def test_a_masked_subject_without_texture_has_no_points(noisy: bool) -> None:
             match(without_outlines)
         assert raised.value.code == ErrorCode.NO_SURFACE
         assert "Check that the masks" in raised.value.remedy
+
+
+@pytest.mark.parametrize("centre", [surface_points(np.array([[0.0, -1.0, 0.0]]))[0], CENTRE])
+def test_a_given_region_that_holds_hardly_a_point_is_to_blame(centre: Float64[np.ndarray, "3"]) -> None:
+    """Not the photographs: within the true region they agree on most of the surface."""
+    region = replace(true_region(), object_from_world=to_unit_sphere(centre, 0.001), given=True)
+    work = partial(match_views, config=StereoConfig(), device=torch.device("cpu"), progress=no_progress)
+    told = hollows_filled(work(scene().views, region), region) or ""
+    assert told.startswith("In the region that was given, of radius 0.001 around (")
+    assert "Give a larger region" in told
+    with pytest.raises(ReconstructionError, match=r"^In the region that was given") as raised:
+        work(scene().without_masks().views, region)
+    assert raised.value.remedy.startswith("Give a larger region")
 
 
 def test_photographs_of_nothing_are_no_surface() -> None:
