@@ -20,6 +20,7 @@ from .scene import Camera, Progress, within
 from .stages.known_cameras import read_cameras
 from .stages.radiance_field import Radiance, restored
 from .stages.radiance_image import RadianceImage, radiance_image
+from .wire.protocol import is_path
 from .workspace import open_workspace
 
 Pixels = UInt8[np.ndarray, "height width channels"]
@@ -80,11 +81,7 @@ def _file_name(frame: str) -> str:
     """Of a frame's picture: digits behind a dot are its number, not what it is written as."""
     last = PurePosixPath(frame.replace("\\", "/")).name
     name = re.sub(r"\.\D\w*$", "", last) + ".png"
-    try:
-        usable = name != ".png" and "\0" not in name and len(os.fsencode(name)) <= _LONGEST_NAME
-    except UnicodeEncodeError:  # half of a pair, which only JSON can tell
-        usable = False
-    if not usable:
+    if name == ".png" or not is_path(name) or len(os.fsencode(name)) > _LONGEST_NAME:
         text = f"No picture can be named after the frame {frame[:80]!r}."
         raise ReconstructionError(
             ErrorCode.CAMERAS_UNUSABLE, text, "Give it a shorter name of letters and digits."

@@ -33,7 +33,8 @@ def check_enough(points: SurfacePoints, views: tuple[View, ...], region: Region)
         ErrorCode.NO_SURFACE,
         f"{_agreement(region)} only {len(points.positions)} points of the surface.",
         f"{_OTHER_REGION * region.given}"
-        "Take photographs that overlap by more than half, sharp and evenly lit; shiny, transparent or plain surfaces need masks, or some texture such as dust or chalk."
+        "Take photographs that overlap by more than half, sharp and evenly lit; shiny, transparent "
+        "or plain surfaces need masks, or some texture such as dust or chalk."
         f"{about_masks * masked}",
     )
 

@@ -7,6 +7,7 @@ sides import this one file, so neither can misspell the other.
 """
 
 import json
+import os
 import types
 import typing
 from collections.abc import Callable
@@ -197,8 +198,24 @@ def decode_job(text: str) -> Job:
         raise ProtocolError(f"job: seed is {job.seed}; it must be from 0 to {LARGEST_SEED}")
     if job.budget_s is not None and job.budget_s <= 0:
         raise ProtocolError(f"job: budget_s is {job.budget_s}; it must be positive")
+    _check_paths(job)
     _check_region(job)
     return job
+
+
+def _check_paths(job: Job) -> None:
+    """ProtocolError for one that no file can have."""
+    for path in filter(None, (*job.images, job.output, job.cameras, job.masks, job.truth)):
+        if not is_path(path):
+            raise ProtocolError(f"job: {path!r} has a letter that the path of a file cannot have")
+
+
+def is_path(text: str) -> bool:
+    """Whether a file may be called so: not with a zero, or half of a pair, which JSON can tell."""
+    try:
+        return b"\0" not in os.fsencode(text)
+    except UnicodeEncodeError:
+        return False
 
 
 def _check_region(job: Job) -> None:

@@ -618,6 +618,12 @@ def test_previews_are_cameras_then_points_then_whole_meshes(case: Case) -> None:
         {"until": "mesh"},
         {"region_centre": [0, 0, 0]},
         {"region_centre": [0, 0, 0], "region_radius": -1.0},
+        {"output": "out\0put"},
+        {"images": ["photos\0"]},
+        pytest.param(
+            {"cameras": "\ud800"},
+            marks=pytest.mark.skipif(sys.platform == "win32", reason="its files may be called so"),
+        ),
     ],
 )
 def test_a_wrong_job_is_refused(case: Case, change: dict[str, object]) -> None:

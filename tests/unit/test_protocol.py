@@ -42,9 +42,17 @@ VALUES = {
 }
 
 
-def any_of(kind: type) -> st.SearchStrategy[typing.Any]:
+PATH = st.text(st.characters(exclude_categories=["Cs"], exclude_characters="\0"))
+PATHS: dict[str, st.SearchStrategy[typing.Any]] = {
+    "images": st.lists(PATH, max_size=3).map(tuple),
+    "output": PATH,
+    **dict.fromkeys(("cameras", "masks", "truth"), st.none() | PATH),
+}
+
+
+def any_of(kind: type, **others: st.SearchStrategy[typing.Any]) -> st.SearchStrategy[typing.Any]:
     """Any valid record of the kind; a field of a new type fails here until it has a strategy."""
-    values = {name: VALUES[hint] for name, hint in typing.get_type_hints(kind).items()}
+    values = {name: VALUES[hint] for name, hint in typing.get_type_hints(kind).items()} | others
     if "protocol" in values:
         values["protocol"] = st.just(PROTOCOL_VERSION)
     return st.builds(kind, **values)
@@ -58,7 +66,7 @@ def test_every_message_comes_back(message: Message) -> None:
     assert decode(line) == message
 
 
-@given(any_of(Job), st.sampled_from(protocol.PRESETS), st.sampled_from(protocol.DEVICES))
+@given(any_of(Job, **PATHS), st.sampled_from(protocol.PRESETS), st.sampled_from(protocol.DEVICES))
 def test_every_job_comes_back(job: Job, preset: str, device: str) -> None:
     values = {f.name: getattr(job, f.name) for f in fields(job)}
     sensible = {
@@ -170,6 +178,8 @@ def test_another_version_is_named_even_if_its_fields_differ(version: object) -> 
         {"budget_s": -1},
         {"budget_s": "1"},
         {"region_centre": [0, 0, "0"], "region_radius": 1},
+        *({name: "a\0b"} for name in ("output", "cameras", "masks", "truth")),
+        {"images": ["a", "a\0b"]},
     ],
 )
 def test_a_job_with_a_wrong_value_is_refused(change: dict[str, object]) -> None:
