@@ -17,6 +17,7 @@ from .commands.fit_points import add_fit_points, fit_points_command
 from .commands.reconstruct import EXIT_FINE, EXIT_USER_ERROR, on_terminal, on_wire
 from .commands.rehearse import ENDS, rehearse
 from .commands.render import add_render, render
+from .standard_streams import open_closed_streams
 from .waiting import set_waiting_policy
 from .wire.environment import BUILDS
 from .wire.protocol import DEVICES, PRESETS, PROTOCOL_VERSION, Job
@@ -27,6 +28,7 @@ _CAMERA_OPTIONS = ("output", "cameras", "masks", "preset", "seed")
 
 def main(arguments: list[str] | None = None) -> int:
     """Run a command; the exit code: 0 fine, 1 a fault of the program, 2 of the input, 130 stopped."""
+    open_closed_streams()
     faulthandler.enable()
     if isinstance(sys.stdout, io.TextIOWrapper):
         # As stderr does: a pipe on Windows knows the letters of one language, and folders may have others.

@@ -242,6 +242,19 @@ def test_a_reader_that_has_seen_enough_is_no_failure(folder: Path) -> None:
     assert (folder / "pictures" / "view_00.png").is_file()
 
 
+@pytest.mark.skipif(sys.platform == "win32", reason="descriptors of POSIX")
+@pytest.mark.parametrize("closed", [">&-", "2>&-", "<&- >&- 2>&-"])
+def test_streams_that_are_closed_are_no_failure(folder: Path, closed: str) -> None:
+    options = ["--cameras", folder / "images" / "transforms.json", "--output", folder / "pictures"]
+    program = [sys.executable, "-m", "backend", "render", folder / "surface", *options]
+    run = subprocess.run(
+        ["sh", "-c", f'"$@" {closed}', "sh", *program], cwd=ROOT, capture_output=True, check=False
+    )
+    assert run.returncode == 0, run.stderr
+    assert b"rror" not in run.stderr
+    assert sorted(path.name for path in (folder / "pictures").glob("*.png"))[0] == "view_00.png"
+
+
 def test_on_the_wire_it_names_its_pictures(folder: Path) -> None:
     options = ["--cameras", folder / "images" / "transforms.json", "--output", folder / "pictures", "--wire"]
     with subprocess.Popen(
