@@ -32,8 +32,9 @@ _LONGEST_NAME = 255
 def render_job(job: Path, cameras: Path, output: Path, device: str, progress: Progress) -> tuple[str, ...]:
     """One PNG in `output` for each of the cameras, named after its frame; their names.
 
-    All appear together at the end. Raises Cancelled where progress does, and ReconstructionError:
-    SETTINGS_INVALID where `job` is no finished job, CAMERAS_UNUSABLE, OUTPUT_UNUSABLE.
+    All appear together at the end, in place of those of an earlier rendering. Raises Cancelled where
+    progress does, and ReconstructionError: SETTINGS_INVALID where `job` is no finished job, CAMERAS_UNUSABLE,
+    OUTPUT_UNUSABLE.
     """
     draw = _drawing(job, device)
     named = _by_file_name(read_cameras(cameras))
@@ -50,7 +51,7 @@ def render_job(job: Path, cameras: Path, output: Path, device: str, progress: Pr
     with open_workspace(output) as workspace:
         try:
             workspace.claim("pictures")
-            workspace.write_results(writers)
+            workspace.write_results(writers, replaced=workspace.results)
         except (ReconstructionError, Cancelled):
             workspace.discard_if_nothing_done()
             raise

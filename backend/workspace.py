@@ -112,6 +112,12 @@ class Workspace:
         frame: str | None = self._read_note().get("frame")
         return frame
 
+    @property
+    def results(self) -> tuple[str, ...]:
+        """Names of the results that were put in place last; none where that was not noted."""
+        names: list[str] = self._read_note().get("results", [])
+        return tuple(name for name in names if Path(name).name == name)  # the note may be a stranger's
+
     def is_finished(self, stage: str, fingerprint: str) -> bool:
         """Whether the stage was finished from exactly the same inputs."""
         note = read_note(self._stage_path(stage))
@@ -155,9 +161,11 @@ class Workspace:
         parts, earlier = self._emptied(_PARTS), self._emptied(_REPLACED)
         for name, write in writers.items():
             write(parts / name)
+        written = {name.casefold() for name in writers}  # as disks see it that do not tell letter cases apart
+        outdated = sorted(name for name in replaced if name.casefold() not in written)
         touched: list[str] = []
         try:
-            for name in (*writers, *sorted(set(replaced) - writers.keys())):
+            for name in (*writers, *outdated):
                 if (self.folder / name).exists():
                     when_let_go(partial((self.folder / name).replace, earlier / name))
                 touched.append(name)
@@ -169,7 +177,7 @@ class Workspace:
         shutil.rmtree(parts, ignore_errors=True)
         shutil.rmtree(earlier, ignore_errors=True)
         # Last: after a kill before it, what is in the folder is taken for that of other cameras.
-        self._write_note({**self._read_note(), "frame": frame})
+        self._write_note({**self._read_note(), "frame": frame, "results": sorted(writers)})
 
     def discard_stages(self) -> None:
         """Remove what only a run that goes on needs: finished stages, scratch files and previews."""

@@ -154,6 +154,16 @@ def test_rendered_again_the_pictures_are_replaced_but_strangers_are_left_alone(f
     assert [path.name for path in (folder / "strange").iterdir()] == ["letter.txt"]
 
 
+def test_rendered_from_fewer_cameras_earlier_pictures_are_gone(folder: Path) -> None:
+    """Ours, not what somebody has put beside them."""
+    rendered(folder, "surface")
+    (folder / "pictures" / "mine.png").write_bytes(b"mine")
+    named(folder, "view_00", "other")
+    assert rendered(folder, "surface") == ("view_00.png", "other.png")
+    found = sorted(path.name for path in (folder / "pictures").glob("*.png"))
+    assert found == ["mine.png", "other.png", "view_00.png"]
+
+
 def test_a_job_s_own_folder_gets_no_pictures(folder: Path) -> None:
     (folder / "nerf" / "cameras.json").write_text("{}")
     error = refusal(folder, output="nerf")

@@ -259,9 +259,24 @@ def test_what_an_earlier_run_left_and_this_one_has_not_is_removed(tmp_path: Path
     with open_workspace(tmp_path / "out") as workspace:
         workspace.write_results({"a": write_text("old a"), "b": write_text("old b")}, replaced=("b",))
         assert (workspace.folder / "b").read_text() == "old b"
+        assert workspace.results == ("a", "b")
         workspace.write_results({"a": write_text("new a")}, replaced=("b", "never"))
+        assert workspace.results == ("a",)
+        # where letter cases are not told apart, the earlier name is that of the new result
+        workspace.write_results({"A": write_text("another")}, replaced=("a",))
+        assert (workspace.folder / "a").exists()
+        assert (workspace.folder / "A").read_text() == "another"
         assert not (workspace.folder / "b").exists()
         assert (workspace.folder / "a").read_text() == "new a"
+
+
+def test_a_note_that_names_files_elsewhere_is_not_believed(tmp_path: Path) -> None:
+    with open_workspace(tmp_path / "out") as workspace:
+        note = workspace.private / "format.json"
+        note.write_text(
+            json.dumps({**json.loads(note.read_text()), "results": ["../theirs", "/theirs", "a"]})
+        )
+        assert workspace.results == ("a",)
 
 
 @pytest.mark.parametrize("stuck", ["b", "c"])
