@@ -76,7 +76,9 @@ def world_from_cameras_or_none(scene: bpy.types.Scene, cameras: Path) -> NDArray
     if roots:
         return world_from_solved(max(roots, key=lambda root: root == scene.fewview.root))
     try:
-        return None if read_solved(cameras).estimated else np.eye(4)
+        # the folder of a finished run stands for the cameras in it
+        file = cameras / CAMERAS if cameras.is_dir() else cameras
+        return None if read_solved(file).estimated else np.eye(4)
     except ValueError:  # another program's, as a COLMAP model
         return np.eye(4)
 

@@ -155,7 +155,7 @@ class FEWVIEW_PG_settings(bpy.types.PropertyGroup):
     )
     cameras_path: StringProperty(
         name="File or Folder",
-        description="A transforms.json, or the folder of a COLMAP model",
+        description="A transforms.json, or the folder of a COLMAP model or of a finished run's results",
         subtype="FILE_PATH",
         options=IN_BLEND,
     )

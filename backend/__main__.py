@@ -118,7 +118,9 @@ def _parser() -> argparse.ArgumentParser:
     add("images", nargs="+", metavar="IMAGES", help="image files or folders; or one job.json")
     add("--output", metavar="DIR", help="new or empty folder, or one of an earlier run to resume")
     add(
-        "--cameras", metavar="FILE_OR_FOLDER", help="transforms.json or COLMAP model; else they are estimated"
+        "--cameras",
+        metavar="FILE_OR_FOLDER",
+        help="transforms.json, COLMAP model or finished run; else they are estimated",
     )
     add("--masks", metavar="FOLDER", help="an image per photograph, white on the subject")
     add("--preset", choices=PRESETS, help="speed against detail (balanced); others: for comparison")

@@ -31,7 +31,7 @@ from .stages.camera_report import build_camera_report
 from .stages.cameras import solve_cameras
 from .stages.confirmation import unconfirmed
 from .stages.disagreement import disagreement
-from .stages.known_cameras import may_be_unturned
+from .stages.known_cameras import cameras_source, may_be_unturned
 from .stages.mesh import extract_mesh
 from .stages.neus_fit import NeusConfig, fit_neus
 from .stages.originals import Original
@@ -399,9 +399,12 @@ def _finished(workspace: Workspace, fingerprints: dict[str, str], names: tuple[s
 
 def _camera_files(cameras: Path | None) -> list[Path | str]:
     """The files that may hold the given cameras; their images are among the photographs."""
-    if cameras is None or not cameras.is_dir():
-        return ["cameras", *([cameras, cameras.with_name(SPARSE)] if cameras else [])]
-    return sorted(path for path in cameras.rglob("*") if path.suffix in _CAMERA_FILES)
+    if cameras is None:
+        return ["cameras"]
+    source = cameras_source(cameras)
+    if source.is_file():
+        return ["cameras", source, source.with_name(SPARSE)]
+    return sorted(path for path in source.rglob("*") if path.suffix in _CAMERA_FILES)
 
 
 def _needed_bytes(num_photos: int, to_come: typing.Collection[str], settings: Settings) -> int:

@@ -23,7 +23,7 @@ def add_render(parser: argparse.ArgumentParser) -> None:
         metavar="FILE_OR_FOLDER",
         type=Path,
         required=True,
-        help="transforms.json or COLMAP model in the job's frame; no pictures are needed",
+        help="transforms.json, COLMAP model or finished run in the job's frame; no pictures are needed",
     )
     add("--output", metavar="DIR", type=Path, required=True, help="new or empty folder, or one rendered into")
     add("--device", choices=protocol.DEVICES, default="auto", help="where to compute (auto)")

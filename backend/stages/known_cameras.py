@@ -25,19 +25,21 @@ _ROTATION_TOLERANCE = 5e-3
 LARGEST_SIDE_PX = 20_000
 """Of a picture to render: 400 million pixels are a slip of the pen."""
 
+_OURS = "cameras.json"
+"""What a finished run leaves."""
 _NOTHING: Mapping[int, str] = MappingProxyType({})
 _CHECK = "Check that the cameras belong to these photographs."
 
 
 def read_placement(photos: Sequence[Photo], given: Path) -> Placement:
-    """The cameras in a transforms.json, a COLMAP model folder, or a folder that has one of them.
+    """The cameras in a transforms.json, a COLMAP model, or the folder of one or of a finished run.
 
     Cameras and photographs are matched by file name; photographs without a camera are not placed. COLMAP does
     not look at the EXIF orientation, so cameras of a model are turned with their photographs; those of a
     transforms.json only where they would not fit else.
     Raises ReconstructionError(CAMERAS_UNUSABLE).
     """
-    source = _find_source(given)
+    source = cameras_source(given)
     return _from_model(photos, source) if source.is_dir() else _from_transforms(photos, source)
 
 
@@ -47,7 +49,7 @@ def read_cameras(given: Path) -> tuple[tuple[str, Camera], ...]:
     A lens that bends light gives the pinhole camera that its photograph would have been undistorted to. The
     file has to tell the pictures' sizes. Raises ReconstructionError(CAMERAS_UNUSABLE).
     """
-    source = _find_source(given)
+    source = cameras_source(given)
     blanks = _blanks_of_model(source) if source.is_dir() else _blanks_of_transforms(source)
     if not blanks:
         raise _unusable(f"{source.name} holds no cameras.", "Export it again.")
@@ -60,7 +62,7 @@ def may_be_unturned(given: Path) -> bool:
 
     Those that others wrote as transforms.json: they may have looked at the EXIF orientation or not.
     """
-    source = _find_source(given)
+    source = cameras_source(given)
     return source.is_file() and not is_ours(read_frames(source))
 
 
@@ -142,8 +144,8 @@ def checked_pose(b_from_a: Float64[np.ndarray, "4 4"], photo_name: str) -> Float
     return exact
 
 
-def _find_source(given: Path) -> Path:
-    """The file or the model folder that is meant."""
+def cameras_source(given: Path) -> Path:
+    """The file or the model folder that is meant. Raises ReconstructionError(CAMERAS_UNUSABLE)."""
     if given.is_file() and given.suffix.lower() == ".json":
         return given
     if given.is_file():
@@ -154,8 +156,12 @@ def _find_source(given: Path) -> Path:
     for folder in (given, given / "sparse" / "0", given / "sparse", given / "0"):
         if any((folder / f"cameras{suffix}").is_file() for suffix in (".bin", ".txt")):
             return folder
+    if (given / _OURS).is_file():
+        return given / _OURS
     text = f"There are no cameras in {given}."
-    raise _unusable(text, "Give a nerfstudio transforms.json or the folder of a COLMAP model.")
+    raise _unusable(
+        text, "Give a nerfstudio transforms.json, or the folder of a COLMAP model or a finished run."
+    )
 
 
 def _from_transforms(photos: Sequence[Photo], path: Path) -> Placement:

@@ -344,12 +344,13 @@ def test_known_cameras_stand_in_the_world(reconstruct: Callable[[], Any], part: 
     assert_region(job, [10, 4, 0], sphere_of(settings.region)[1])
 
 
+@pytest.mark.parametrize("chosen", ["result/cameras.json", "result"])
 def test_estimated_cameras_of_a_file_have_to_be_loaded(
-    reconstruct: Callable[[], Any], part: Part, tmp_path: Path
+    reconstruct: Callable[[], Any], part: Part, tmp_path: Path, chosen: str
 ) -> None:
-    file = make_job(part, tmp_path / "elsewhere") / "result/cameras.json"
+    given = make_job(part, tmp_path / "elsewhere") / chosen
     settings = bpy.context.scene.fewview
-    settings.camera_source, settings.cameras_path = "KNOWN", str(file)
+    settings.camera_source, settings.cameras_path = "KNOWN", str(given)
     bpy.ops.fewview.add_region()
     with pytest.raises(RuntimeError, match="estimate or load them"):
         reconstruct()

@@ -212,6 +212,19 @@ def test_cameras_that_were_estimated_stay_so_in_a_later_job(tmp_path: Path) -> N
     assert "cameras.json" in again.decisions[0].because
 
 
+def test_the_folder_of_a_finished_run_gives_its_cameras(tmp_path: Path) -> None:
+    found = estimated_before(tmp_path)
+    (tmp_path / "transforms.json").unlink()
+    again = solve(PHOTOS, tmp_path, tmp_path)
+    assert again.estimated
+    np.testing.assert_array_equal(again.sparse_positions, found.sparse_positions)
+    assert [name for name, _ in read_cameras(tmp_path)] == ["a.jpg", "c.jpg"]
+    (tmp_path / "cameras.json").unlink()
+    with pytest.raises(ReconstructionError, match="There are no cameras in") as caught:
+        solve(PHOTOS, tmp_path, tmp_path)
+    assert "finished run" in caught.value.remedy
+
+
 def test_points_that_two_of_fewer_photographs_see(tmp_path: Path) -> None:
     found = estimated_before(tmp_path)
     seen = np.ones((30, 3), bool)

@@ -142,6 +142,24 @@ def test_a_photograph_or_mask_that_changed_is_read_again(photos: Path, tmp_path:
     assert not kept_after(job_of(photos, masks=masks), lambda: Image.fromarray(change).save(tmp_path / name))
 
 
+def test_what_else_lies_with_given_cameras_does_not_count(photos: Path, tmp_path: Path) -> None:
+    """In the folder of a finished run the log grows; its points beside the cameras are read with them."""
+    folder = tmp_path / "finished"
+    folder.mkdir()
+    for name in ("cameras.json", "sparse.ply", "log.txt"):
+        (folder / name).write_text("before")
+    job = job_of(photos, cameras=folder)
+
+    def of_cameras() -> str:
+        return pipeline.stage_fingerprints(job, pipeline._files(job), SETTINGS, "cpu")["cameras"]
+
+    before = of_cameras()
+    (folder / "log.txt").write_text("after")
+    assert of_cameras() == before
+    (folder / "sparse.ply").write_text("after")
+    assert of_cameras() != before
+
+
 def test_masks_that_are_no_longer_given_are_forgotten(photos: Path, tmp_path: Path) -> None:
     masks = make_photos(tmp_path / "masks", 5)
     up_to_the_cameras(job_of(photos, masks=masks))
