@@ -226,7 +226,9 @@ def _read_job(path: Path) -> protocol.Job:
     """The job of the file; ReconstructionError(SETTINGS_INVALID) where it is none."""
     remedy = "Write the file as backend/wire/protocol.py describes it."
     try:
-        return protocol.decode_job(path.read_text(encoding="utf-8-sig"))
+        job = protocol.decode_job(path.read_text(encoding="utf-8-sig"))
+        protocol.check_paths(job)
+        return job
     except (OSError, UnicodeDecodeError, protocol.ProtocolError) as error:
         text = f"The job file {path} cannot be used: {error}."
         raise ReconstructionError(ErrorCode.SETTINGS_INVALID, text, remedy) from error

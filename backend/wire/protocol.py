@@ -198,13 +198,12 @@ def decode_job(text: str) -> Job:
         raise ProtocolError(f"job: seed is {job.seed}; it must be from 0 to {LARGEST_SEED}")
     if job.budget_s is not None and job.budget_s <= 0:
         raise ProtocolError(f"job: budget_s is {job.budget_s}; it must be positive")
-    _check_paths(job)
     _check_region(job)
     return job
 
 
-def _check_paths(job: Job) -> None:
-    """ProtocolError for one that no file can have."""
+def check_paths(job: Job) -> None:
+    """ProtocolError for one that no file can have: who only looks at a job need not mind."""
     for path in filter(None, (*job.images, job.output, job.cameras, job.masks, job.truth)):
         if not is_path(path):
             raise ProtocolError(f"job: {path!r} has a letter that the path of a file cannot have")
