@@ -21,7 +21,7 @@ from ..backend.maths.upright import up_direction
 from ..backend.wire.photographs import is_named, is_of_phone
 from .camera_lens import apply_lens
 from .exif_orientation import clockwise_turn_deg
-from .intrinsics import Pinhole, aspect_pair, shared_aspect_or_none
+from .intrinsics import SAME_ASPECT, Pinhole, aspect_pair, shared_aspect_or_none
 from .job_folder import CAMERAS, SPARSE, results_in
 from .placing import upright_from_solved
 from .ply import PlyMesh, read_ply
@@ -61,9 +61,10 @@ def read_import(folder: Path, photographs: tuple[Path, ...]) -> CameraImport:
     )
 
 
-def import_steps(scene_name: str, wanted: CameraImport) -> Iterator[None]:
+def import_steps(scene_name: str, wanted: CameraImport, warnings: list[str]) -> Iterator[None]:
     """Make the objects, in steps for a timer, and set `scene.fewview.root`.
 
+    What is changed of the scene's own settings is added to the warnings.
     Between two steps the user may undo, so each finds its objects anew. The caller pushes the undo step.
     Raises ValueError for a camera that Blender does not have.
     """
@@ -71,7 +72,7 @@ def import_steps(scene_name: str, wanted: CameraImport) -> Iterator[None]:
         _make_camera(scene_named(scene_name), wanted, camera)
         yield
     _remove_old_cameras(scene_named(scene_name), wanted)
-    set_pixel_aspect(scene_named(scene_name), wanted.solved)
+    warnings += set_pixel_aspect(scene_named(scene_name), wanted.solved)
     yield
     if wanted.points is not None and len(wanted.points.positions):
         _make_points(scene_named(scene_name), wanted, wanted.points)
@@ -108,11 +109,20 @@ def photograph_or_none(name: str, photographs: Sequence[Path]) -> Path | None:
     return found[0] if len(found) == 1 else None
 
 
-def set_pixel_aspect(scene: bpy.types.Scene, solved: SolvedScene) -> None:
-    """Give the scene the pixel aspect that the cameras share, if they do."""
+def set_pixel_aspect(scene: bpy.types.Scene, solved: SolvedScene) -> tuple[str, ...]:
+    """Give the scene the pixel aspect that the cameras share, if they do and it has another: it is told."""
     aspect = shared_aspect_or_none(tuple(camera.pinhole for camera in solved.cameras))
-    if aspect is not None:
-        scene.render.pixel_aspect_x, scene.render.pixel_aspect_y = aspect_pair(aspect)
+    render = scene.render
+    before = render.pixel_aspect_y / render.pixel_aspect_x
+    if aspect is None or abs(aspect - before) <= SAME_ASPECT * before:
+        return ()
+    old = f"{render.pixel_aspect_x:g} : {render.pixel_aspect_y:g}"
+    render.pixel_aspect_x, render.pixel_aspect_y = aspect_pair(aspect)
+    new = f"{render.pixel_aspect_x:g} : {render.pixel_aspect_y:g}"
+    return (
+        f"The scene's pixel aspect was {old} and is now {new}, which the cameras need: change it back for "
+        "your own renders",
+    )
 
 
 def objects_of(scene: bpy.types.Scene, job: str, role: str) -> list[bpy.types.Object]:

@@ -10,7 +10,7 @@ import sys
 import threading
 import time
 import traceback
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -184,6 +184,12 @@ def start(
         about_scene=about_scene,
         remedy=remedy,
     )
+
+
+def warn(texts: Iterable[str]) -> None:
+    """Add to what the user is told of the running job, each sentence once."""
+    if _running is not None:
+        _running.warnings += [text for text in texts if text not in _running.warnings]
 
 
 def follow(operator: bpy.types.Operator) -> set[str]:

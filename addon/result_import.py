@@ -30,10 +30,16 @@ _SAME_PLACE = 1e-4
 
 
 def import_result_steps(
-    folder: Path, *, scene_name: str, cameras: bool = True, undo: bool = True
+    folder: Path,
+    *,
+    scene_name: str,
+    cameras: bool = True,
+    undo: bool = True,
+    warnings: list[str] | None = None,
 ) -> Iterator[None]:
     """Import the mesh of a job, and its cameras, in steps short enough for a timer, as one undo step.
 
+    What the user should know is added to the warnings.
     The cameras of an earlier job that this one was given are left as they are, and so are cameras of the
     user's that the views were rendered from. Give `undo` False where an operator makes the undo step
     itself. The mesh is read first: where it cannot be used, the scene is left as it is. Raises
@@ -53,7 +59,7 @@ def import_result_steps(
         and frame_owner(job) == job.folder
         and not _are_there(scene, found.solved)
     ):
-        yield from import_steps(scene_name, found)
+        yield from import_steps(scene_name, found, [] if warnings is None else warnings)
         scene = scene_named(scene_name)
     root = root_or_none(scene, str(frame_owner(job).absolute()))
     wanted = MeshImport(
@@ -80,15 +86,18 @@ def import_fit_steps(folder: Path, *, scene_name: str, name: str = "", undo: boo
         undo_step.push(f"Import {name or folder.name}")
 
 
-def show_estimated_cameras(path: Path, job: PastJob, scene_name: str) -> Iterator[None]:
-    """Show cameras that a running job has found, so that its previews have a place; none that were known."""
+def show_estimated_cameras(path: Path, job: PastJob, scene_name: str, warnings: list[str]) -> Iterator[None]:
+    """Show cameras that a running job has found, so that its previews have a place; none that were known.
+
+    What the user should know is added to the warnings.
+    """
     solved = read_solved(path)
     yield
     if solved.estimated and frame_owner(job) == job.folder:
         wanted = CameraImport(
             job=str(job.folder.absolute()), solved=solved, photographs=_photographs(job), points=None
         )
-        yield from import_steps(scene_name, wanted)
+        yield from import_steps(scene_name, wanted, warnings)
 
 
 def world_from_solved(

@@ -212,7 +212,7 @@ def show_cameras(scene_name: str, folder: Path, warnings: list[str]) -> Iterator
     """
     wanted = camera_objects.read_import(folder, _photographs(folder, scene_name))
     yield
-    yield from camera_objects.import_steps(scene_name, wanted)
+    yield from camera_objects.import_steps(scene_name, wanted, warnings)
     settings = scene_named(scene_name).fewview
     settings.cameras_job = str(folder)
     for image in settings.images:
@@ -226,9 +226,7 @@ def show_cameras(scene_name: str, folder: Path, warnings: list[str]) -> Iterator
 def _on_finished(scene_uid: int, folder: Path, _: object) -> Iterator[None]:
     warnings: list[str] = []
     yield from show_cameras(scene_name_of(scene_uid), folder, warnings)
-    job = jobs.running()
-    if job is not None:
-        job.warnings += [text for text in warnings if text not in job.warnings]
+    jobs.warn(warnings)
     undo_step.push("Estimate Cameras")
 
 

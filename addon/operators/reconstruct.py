@@ -182,13 +182,15 @@ def start(python: Path, folder: Path, asked: Job, *, scene_name: str) -> None:
     job = PastJob(folder=folder, job=asked)
     uid = scene_named(scene_name).session_uid
     estimated = True
+    warnings: list[str] = []
 
     def on_preview(shown: Path) -> jobs.Steps:
         nonlocal estimated
         scene_name = scene_name_of(uid)
         if shown.suffix == ".json":
             estimated = read_solved(shown).estimated
-            yield from show_estimated_cameras(shown, job, scene_name)
+            yield from show_estimated_cameras(shown, job, scene_name, warnings)
+            jobs.warn(warnings)
             return
         frame = world_from_solved_or_none(scene_named(scene_name), job, estimated=estimated)
         if frame is not None:
@@ -196,7 +198,9 @@ def start(python: Path, folder: Path, asked: Job, *, scene_name: str) -> None:
             yield from show_preview(shown, wanted)
 
     def on_finished(_: Finished) -> jobs.Steps:
-        yield from import_result_steps(folder, scene_name=scene_name_of(uid), undo=not bpy.app.background)
+        undo = not bpy.app.background
+        yield from import_result_steps(folder, scene_name=scene_name_of(uid), undo=undo, warnings=warnings)
+        jobs.warn(warnings)
 
     jobs.start(
         "Reconstructing",

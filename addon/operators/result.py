@@ -62,11 +62,15 @@ class FEWVIEW_OT_import_result(bpy.types.Operator):
     def execute(self, context: bpy.types.Context) -> Status:
         try:
             folder = self._folder(context)
-            scene = context.scene.name
-            for _ in import_result_steps(folder, scene_name=scene, cameras=self.cameras, undo=False):
+            warnings: list[str] = []
+            for _ in import_result_steps(
+                folder, scene_name=context.scene.name, cameras=self.cameras, undo=False, warnings=warnings
+            ):
                 pass
         except (ValueError, OSError) as error:
             return refused(self, error)
+        for text in warnings:
+            self.report({"WARNING"}, text)
         self.report({"INFO"}, f"Imported {folder.name}")
         return {"FINISHED"}
 

@@ -365,6 +365,31 @@ def test_pixels_that_are_not_square_are_the_scenes(part: Any, job: Path) -> None
     assert any("distorted" in text for text in part("camera_objects").problems(wanted))
 
 
+def aspect(render: Any) -> tuple[float, float]:
+    return render.pixel_aspect_x, render.pixel_aspect_y
+
+
+def test_a_change_of_the_scenes_pixels_is_told(part: Any, job: Path) -> None:
+    render = bpy.context.scene.render
+    render.pixel_aspect_x, render.pixel_aspect_y = 1.0, 1.5
+    told: list[str] = []
+    for _ in part("operators.cameras").show_cameras("Scene", job, told):
+        pass
+    assert aspect(render) == (1.0, 1.0)
+    assert any("pixel aspect was 1 : 1.5 and is now 1 : 1" in text for text in told)
+
+
+def test_square_pixels_of_another_kind_stay(part: Any, job: Path) -> None:
+    """Two numbers that are alike say the same, whichever they are."""
+    render = bpy.context.scene.render
+    render.pixel_aspect_x = render.pixel_aspect_y = 2.0
+    told: list[str] = []
+    for _ in part("operators.cameras").show_cameras("Scene", job, told):
+        pass
+    assert aspect(render) == (2.0, 2.0)
+    assert not any("pixel aspect" in text for text in told)
+
+
 def test_unplaced_photographs_are_marked_in_the_list(part: Any, job: Path) -> None:
     image = bpy.context.scene.fewview.images.add()
     image.path = str(job / "d.png")

@@ -140,6 +140,20 @@ def test_no_tick_keeps_blender_from_its_user(rehearsal: Rehearsal) -> None:
     assert 0 < min(longest) < TICK_LIMIT_S, longest
 
 
+def test_a_change_of_the_scenes_pixels_is_told_once(rehearsal: Rehearsal) -> None:
+    """By a job whose previews need it, and by an import of its result into another scene."""
+    words = "pixel aspect was 1 : 1.5 and is now 1 : 1"
+    bpy.context.scene.render.pixel_aspect_y = 1.5
+    folder = rehearsal.start()
+    assert sum(words in text for text in rehearsal.to_end().warnings) == 1
+    other = bpy.data.scenes.new("other")
+    other.render.pixel_aspect_y = 1.5
+    told: list[str] = []
+    for _ in rehearsal.part("result_import").import_result_steps(folder, scene_name="other", warnings=told):
+        pass
+    assert [words in text for text in told] == [True]
+
+
 def test_several_jobs_one_after_another(rehearsal: Rehearsal) -> None:
     folders = []
     for _ in range(2):
