@@ -148,7 +148,7 @@ def world_from_solved(root: bpy.types.Object | None) -> NDArray[np.float64]:
 
 def cameras_with_photographs(scene: bpy.types.Scene) -> list[bpy.types.Object]:
     """The cameras that imports have made, by photograph."""
-    found = [made for made in scene.objects if made.type == "CAMERA" and made.get(PHOTO)]
+    found = [made for made in scene.objects if PHOTO in made and made.type == "CAMERA" and made[PHOTO]]
     return sorted(found, key=lambda camera: str(camera.get(PHOTO, "")))
 
 
@@ -170,7 +170,7 @@ def camera_of_photograph(scene: bpy.types.Scene, photograph: str) -> bpy.types.O
 
 def jobs_of(scene: bpy.types.Scene) -> tuple[str, ...]:
     """The jobs of which something was imported."""
-    ours = [made for made in scene.objects if made.get(ROLE) in {ROOT, CAMERA, POINTS}]
+    ours = [made for made in scene.objects if ROLE in made and made[ROLE] in {ROOT, CAMERA, POINTS}]
     return tuple(sorted({str(made.get(JOB, "")) for made in ours}))
 
 

@@ -34,11 +34,18 @@ def scene_name_of(uid: int) -> str:
 
 def in_scene(scene: bpy.types.Scene, made: bpy.types.Object | None) -> bpy.types.Object | None:
     """The object of a setting; None where it was deleted: the setting keeps it alive, out of the scene."""
-    found = None if made is None else scene.objects.get(made.name)
+    if made is None or any(made.visible_get(view_layer=layer) for layer in scene.view_layers):
+        return made  # known at once, while the scene looks through the names of all its objects
+    found = scene.objects.get(made.name)
     if found is None or found == made:
         return found
     # Of several with one name, some of them linked from other files, the look-up gives the first.
     return next((other for other in scene.objects if other == made), None)
+
+
+def has_camera(scene: bpy.types.Scene) -> bool:
+    """Whether there is one to render from."""
+    return scene.camera is not None or any(made.type == "CAMERA" for made in scene.objects)
 
 
 def object_or_none(scene: bpy.types.Scene, name: str) -> bpy.types.Object | None:

@@ -57,7 +57,7 @@ def generate(scene: bpy.types.Scene, target: bpy.types.Object, plan: ViewPlan) -
 
 def generated(scene: bpy.types.Scene) -> list[bpy.types.Object]:
     """The generated cameras of the scene, in order."""
-    found = [made for made in scene.objects if made.type == "CAMERA" and VIEW in made]
+    found = [made for made in scene.objects if VIEW in made and made.type == "CAMERA"]
     return sorted(found, key=lambda camera: (camera[VIEW], camera.name))
 
 

@@ -18,7 +18,7 @@ from ..job_folder import LOG, can_be_rendered, inside, new_folder, results_in
 from ..placing import solved_from_camera
 from ..properties import IN_BLEND, settings_of
 from ..result_mesh import result_or_none
-from ..scenes import object_or_none
+from ..scenes import has_camera, object_or_none
 from ..solved import SolvedCamera, write_cameras
 from ..view_rendering import IMAGES, TRANSFORMS
 from .environment import backend_python_or_reason, reason_against_a_job
@@ -55,7 +55,7 @@ class FEWVIEW_OT_render_novel_views(OnResult, bpy.types.Operator):
         reason = reason_against_a_job(context)
         if not reason and not can_be_rendered(_folder_of(result_or_none(context))):
             reason = "The files of the job are gone: reconstruct again"
-        if not reason and not any(made.type == "CAMERA" for made in context.scene.objects):
+        if not reason and not has_camera(context.scene):
             reason = "Add a camera first"
         if reason:
             cls.poll_message_set(reason)

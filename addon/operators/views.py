@@ -14,7 +14,7 @@ from ..arguments import argument, fill_in
 from ..camera_objects import selected_cameras
 from ..job_folder import new_folder
 from ..properties import FEWVIEW_PG_settings, settings_of
-from ..scenes import in_scene, object_named, reason_against_changes, scene_name_of, scene_named
+from ..scenes import has_camera, in_scene, object_named, reason_against_changes, scene_name_of, scene_named
 from ..solved import read_solved
 from ..true_mesh import WITH_SURFACE
 from ..view_cameras import ViewPlan
@@ -141,7 +141,7 @@ class FEWVIEW_OT_render_views(bpy.types.Operator):
         if jobs.running() is not None:
             cls.poll_message_set("Wait for the running job, or cancel it")
             return False
-        if not any(made.type == "CAMERA" for made in context.scene.objects):
+        if not has_camera(context.scene):
             cls.poll_message_set("Generate cameras first, or add one")
             return False
         return True

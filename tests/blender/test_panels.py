@@ -791,6 +791,31 @@ def test_all_panels_after_undo_and_in_another_file(sidebar: Sidebar) -> None:
     assert sidebar.line("images") == ("CHECKMARK", "3 photographs")
 
 
+def test_what_panels_ask_of_a_scene_of_many_objects_is_quick(sidebar: Sidebar) -> None:
+    """They are drawn many times a second: a known object is found at once, ours in one short pass."""
+    scene, mesh = bpy.context.scene, bpy.data.meshes.new("many")
+    for index in range(4_000):
+        scene.collection.objects.link(bpy.data.objects.new(f"{index}", mesh))
+    result, in_scene, jobs_of = (
+        sidebar.result(),
+        sidebar.part("scenes").in_scene,
+        sidebar.part("camera_objects").jobs_of,
+    )
+
+    def shortest_s(work: Callable[[], object]) -> float:
+        """Of many: now and then another program has the core."""
+        times = []
+        for _ in range(30):
+            started = time.perf_counter()
+            work()
+            times.append(time.perf_counter() - started)
+        return min(times)
+
+    one_pass_s = shortest_s(lambda: [made for made in scene.objects if "mark" in made])
+    assert shortest_s(lambda: in_scene(scene, result)) < one_pass_s / 10
+    assert shortest_s(lambda: jobs_of(scene)) < 2 * one_pass_s
+
+
 def test_a_narrow_sidebar_breaks_lines_and_loses_no_word(sidebar: Sidebar) -> None:
     text = "3 to 20 pictures of one thing, each from a step further round it"
     for width in (1, 120, 300, 2000):
