@@ -77,9 +77,8 @@ def _reconstruct(parser: argparse.ArgumentParser, parsed: argparse.Namespace) ->
         return on_wire(Path(parsed.images[0]))
     if "output" not in given:
         parser.error("--output is needed")
-    return on_terminal(
-        Job(protocol=PROTOCOL_VERSION, images=tuple(parsed.images), **given, **region, **budget)
-    )
+    job = Job(protocol=PROTOCOL_VERSION, images=tuple(parsed.images), **given, **region, **budget)
+    return on_terminal(job, stop_with_stdin=parsed.stop_with_stdin)
 
 
 def _cameras(parsed: argparse.Namespace) -> int:
@@ -140,6 +139,7 @@ def _parser() -> argparse.ArgumentParser:
         metavar="S",
         help="time for fitting the surface, the rest of the run not counted (what the preset needs)",
     )
+    add("--stop-with-stdin", action="store_true", help=argparse.SUPPRESS)
     _add_cameras(
         commands.add_parser("cameras", help="find where photographs were taken, and how sure that is")
     )

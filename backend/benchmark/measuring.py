@@ -159,7 +159,7 @@ def measure(
     last_lines: deque[str] = deque(maxlen=2)
     started = time.perf_counter()
     exit_code = run_child(
-        (*program, *reconstruct_words(trial, output)),
+        (*program, *reconstruct_words(trial, output), "--stop-with-stdin"),
         environment=clean_environment(without_own_policy(os.environ)),
         folder=ROOT,
         request=request,

@@ -28,18 +28,25 @@ EXIT_FINE, EXIT_INTERNAL, EXIT_USER_ERROR = 0, 1, 2
 logger = logging.getLogger(__name__)
 
 
-def on_terminal(job: protocol.Job) -> int:
+def on_terminal(job: protocol.Job, *, stop_with_stdin: bool = False) -> int:
     """Run the job with progress on stderr and the names of the results on stdout; the exit code."""
     return with_terminal(
         lambda listener: listener.finished(Path(job.output), run_job(_checked(job), Path(), listener)),
         cancelled=lambda listener: listener.cancelled(),
+        stop_with_stdin=stop_with_stdin,
     )
 
 
 def with_terminal(
-    work: Callable[["TerminalListener"], None], *, cancelled: Callable[["TerminalListener"], None]
+    work: Callable[["TerminalListener"], None],
+    *,
+    cancelled: Callable[["TerminalListener"], None],
+    stop_with_stdin: bool = False,
 ) -> int:
-    """Do the work before a person's eyes, who may stop it; the exit code."""
+    """Do the work before a person's eyes, who may stop it; the exit code.
+
+    Give `stop_with_stdin` where a program started it: it is not to outlive that, however it ends.
+    """
     try:
         from ..terminal import terminal_listener  # here, because rich may be missing
     except ImportError as error:
@@ -49,6 +56,8 @@ def with_terminal(
     request = CancelRequest()
     with terminal_listener(request) as listener:
         watch_signals(request, listener.stopping)
+        if stop_with_stdin:
+            watch_stdin(request)
         return settle(lambda: work(listener), failed=listener.failed, cancelled=lambda: cancelled(listener))
 
 

@@ -4,6 +4,7 @@ import errno
 import json
 import subprocess
 import sys
+import textwrap
 import time
 from argparse import ArgumentParser, Namespace
 from dataclasses import replace
@@ -22,6 +23,7 @@ from backend.commands import benchmark as command
 from backend.commands.cancelling import EXIT_CANCELLED, CancelRequest
 from backend.commands.reconstruct import EXIT_FINE, EXIT_USER_ERROR
 from backend.wire.client import ROOT
+from tests.unit.test_install import is_alive
 
 # The small stages of the end-to-end tests; they must get the photographs that the case gives, and no others.
 PROGRAM = """
@@ -267,6 +269,36 @@ def test_a_polite_kill_ends_the_run_as_ctrl_c_does(tmp_path: Path) -> None:
         assert process.stderr is not None
         assert "Stopped; what was measured" in process.stderr.read()
     assert process.returncode == EXIT_CANCELLED
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX")
+def test_a_benchmark_that_is_killed_leaves_no_run_behind(photos: Path, tmp_path: Path) -> None:
+    number = tmp_path / "number"
+    told = f"import os, pathlib; pathlib.Path({str(number)!r}).write_text(str(os.getpid()))"
+    program = (sys.executable, "-c", f"{told}\n{PROGRAM}", "hang", "train", "0")
+    code = f"""
+        from pathlib import Path
+        from backend.benchmark.measuring import Trial, measure
+        from backend.commands.cancelling import CancelRequest
+        from tests.unit.test_benchmark_run import CASE
+
+        folder, out = Path({str(photos / "toy")!r}), Path({str(tmp_path / "out")!r})
+        trial = Trial(case=CASE, folder=folder, preset="fast", seed=0, device="cpu")
+        measure(trial, out, inputs="", program={program!r}, request=CancelRequest())
+    """
+    with subprocess.Popen([sys.executable, "-c", textwrap.dedent(code)], cwd=ROOT) as benchmark:
+        deadline = time.monotonic() + 60
+        done = tmp_path / "done"
+        while not (done.exists() and "train" in done.read_text()):
+            assert benchmark.poll() is None
+            assert time.monotonic() < deadline, "the run never began"
+            time.sleep(0.05)
+        benchmark.kill()
+    run = int(number.read_text())
+    deadline = time.monotonic() + 10  # the promise is 2 s; the machine of the tests may be busy
+    while is_alive(run):
+        assert time.monotonic() < deadline, "the run outlives its benchmark"
+        time.sleep(0.05)
 
 
 def test_a_failed_write_loses_no_numbers(

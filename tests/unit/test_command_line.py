@@ -16,7 +16,7 @@ from backend.wire.protocol import Job
 @pytest.fixture
 def jobs(monkeypatch: pytest.MonkeyPatch) -> list[Job]:
     given: list[Job] = []
-    monkeypatch.setattr(program, "on_terminal", lambda job: given.append(job) or 0)
+    monkeypatch.setattr(program, "on_terminal", lambda job, **_: given.append(job) or 0)
     monkeypatch.setattr(program, "on_wire", lambda path: given.append(path) or 0)
     return given
 
