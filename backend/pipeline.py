@@ -291,7 +291,8 @@ def _placed(
     job: Job, files: _Files, this: _Run, settings: Settings, stages: Stages
 ) -> tuple[SolvedCameras, Region]:
     """Where each photograph was taken, and what of the world is to be reconstructed."""
-    if text := passed_over_text(passed_over([source for source in job.images if source.is_dir()])):
+    sources = job.images if job.masks is None else (*job.images, job.masks)
+    if text := passed_over_text(passed_over(sources)):
         this.warn(text)
     if not job.masks and (text := unused_masks_text(job.images)):
         this.warn(text)

@@ -13,9 +13,13 @@ from ..images import DecodedImage, read_image, resized, same_shape, upright
 from ..scene import Photo, Progress
 from ..wire.photographs import (
     KINDS,
+    MASK_ENDINGS,
     first_names,
+    is_readable,
     masks_among,
     names_of,
+    passed_over,
+    passed_over_text,
     photographs_in,
     pictures_in,
     spelling,
@@ -62,7 +66,8 @@ def named_photos(sources: Sequence[Path]) -> dict[str, Path]:
 def find_photos(sources: Sequence[Path]) -> list[Path]:
     """Photographs among the sources, each once, in natural order; of a folder its visible image files.
 
-    Masks of the others, as a_mask.png beside a.jpg, are none.
+    Masks of the others, as a_mask.png beside a.jpg, are none. Nor are files of kinds that cannot be read:
+    of a raw photograph it would be the thumbnail.
     """
     found: dict[Path, Path] = {}
     for source in sources:
@@ -71,21 +76,24 @@ def find_photos(sources: Sequence[Path]) -> list[Path]:
                 ErrorCode.NO_PHOTOS, f"There is no file or folder {source}.", "Check the path."
             )
         members = photographs_in(source) if source.is_dir() else [source]
-        found.update({path.resolve(): path for path in members})
+        found.update({path.resolve(): path for path in members if is_readable(path)})
     masks = masks_among(found.values())
     found = {place: path for place, path in found.items() if path not in masks}
+    skipped = passed_over_text(passed_over(sources))
     if not found:
         places = ", ".join(str(source) for source in sources) or "the list"
         text = f"There are no photographs in {places}."
         raise ReconstructionError(
-            ErrorCode.NO_PHOTOS, text, f"Give a folder with photographs: {KINDS} can be read."
+            ErrorCode.NO_PHOTOS,
+            text,
+            skipped or f"Give a folder with photographs: {KINDS} can be read.",
         )
     if len(found) == 1:
         text = "There is only one photograph."
         raise ReconstructionError(
             ErrorCode.TOO_FEW_PHOTOS,
             text,
-            "Take at least two, or better three or more, from different places.",
+            skipped or "Take at least two, or better three or more, from different places.",
         )
     return sorted(found.values(), key=lambda path: (natural_order(path.name), str(path)))
 
@@ -99,8 +107,9 @@ def natural_order(name: str) -> tuple[tuple[int, int, str], ...]:
 def match_masks(photos: Mapping[str, Path], masks_folder: Path) -> dict[str, Path]:
     """The mask file of each photograph that has one, by the photograph's name.
 
-    For a.jpg: a.jpg_mask.png, a.jpg.png, a_mask.png or a.png, in any image format and letter case; the first
-    of these that there is. No photograph is a mask, and no mask that of two photographs.
+    For a.jpg: a.jpg_mask.png, a.jpg.mask.png, a.jpg.png, a_mask.png, a.mask.png or a.png, in any image
+    format and letter case; the first of these that there is. No photograph is a mask, and no mask that of
+    two photographs.
     Raises ReconstructionError(MASK_UNUSABLE).
     """
     if not masks_folder.is_dir():
@@ -112,7 +121,7 @@ def match_masks(photos: Mapping[str, Path], masks_folder: Path) -> dict[str, Pat
     photo_of: dict[Path, str] = {}
     for name in photos:
         base = Path(name)
-        stems = (f"{base.name}_mask", base.name, f"{base.stem}_mask", base.stem)
+        stems = [own + ending for own in (base.name, base.stem) for ending in (*MASK_ENDINGS, "")]
         mask = next((by_stem[spelling(stem)] for stem in stems if spelling(stem) in by_stem), None)
         if mask in photo_of:
             text = f"The mask {mask.name} could be that of {photo_of[mask]} or of {name}."
@@ -122,7 +131,8 @@ def match_masks(photos: Mapping[str, Path], masks_folder: Path) -> dict[str, Pat
             photo_of[mask] = name
     if not photo_of:
         text = f"No mask in {masks_folder} is named like a photograph."
-        raise ReconstructionError(ErrorCode.MASK_UNUSABLE, text, _naming_text(next(iter(photos))))
+        remedy = passed_over_text(passed_over([masks_folder])) or _naming_text(next(iter(photos)))
+        raise ReconstructionError(ErrorCode.MASK_UNUSABLE, text, remedy)
     return {name: mask for mask, name in photo_of.items()}
 
 
@@ -240,7 +250,13 @@ def _has_shape(values: Float32[np.ndarray, "_ _"], width: int, height: int) -> b
 
 
 def _mask_values(decoded: DecodedImage) -> Float32[np.ndarray, "height width"]:
-    """The alpha channel, or else the brightness; 1 where it is largest: some tools write 1 of 255."""
-    values = decoded.image_srgb.mean(axis=2) if decoded.mask is None else decoded.mask
+    """An alpha channel that cuts out a subject, or else the brightness; 1 where it is largest.
+
+    Some tools write 1 of 255; some leave an alpha channel that cuts out nothing, or all, beside a mask in
+    colours. Where those are even, as of a subject before nothing, alpha counts whatever it cuts out.
+    """
+    brightness, alpha = decoded.image_srgb.mean(axis=2), decoded.mask
+    is_cut_out = alpha is not None and is_outline(alpha) and alpha.max() > 0.5
+    values = alpha if alpha is not None and (is_cut_out or np.ptp(brightness) == 0) else brightness
     largest = float(values.max())
     return values if largest == 0 else (values / largest).astype(np.float32)

@@ -51,7 +51,7 @@ def test_photographs_of_a_folder(tmp_path: Path) -> None:
 
 
 def test_masks_of_photographs_are_none(tmp_path: Path) -> None:
-    touched(tmp_path, "1.jpg", "1_mask.png", "2.HEIC", "2.JPG", "2.jpg_MASK.png", "3_mask.png")
+    touched(tmp_path, "1.jpg", "1_mask.png", "2.HEIC", "2.JPG", "2.jpg_MASK.png", "2.Mask.tif", "3_mask.png")
     assert sorted(path.name for path in photographs_in(tmp_path)) == ["1.jpg", "2.JPG", "3_mask.png"]
 
 
