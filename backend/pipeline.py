@@ -30,6 +30,7 @@ from .stages.camera_refinement import match_solved, with_refined
 from .stages.camera_report import build_camera_report
 from .stages.cameras import solve_cameras
 from .stages.confirmation import unconfirmed
+from .stages.copies import copies_apart_text
 from .stages.disagreement import disagreement
 from .stages.known_cameras import may_be_unturned
 from .stages.mesh import extract_mesh
@@ -311,6 +312,8 @@ def _placed(
     solve = partial(stages.solve_cameras, photos, job.cameras, settings.cameras, **scratch)
     solved = this.stage("cameras", solve)
     _warn_of_unplaced(solved, len(photos), this)
+    if text := copies_apart_text(solved.views):
+        this.warn(text)
     if doubt := unconfirmed(solved):
         this.warn(doubt)
     del photos, solve  # the views hold what is needed of them
