@@ -4,13 +4,16 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
+from jaxtyping import Bool
+
 from ..errors import ErrorCode, ReconstructionError
 from ..scene import Photo, Progress, SolvedCameras, Unplaced
 from .copies import originals_of_copies, originals_of_placed_copies
-from .known_cameras import read_placement
 from .lenses import Placement, photo_lens, undistorted_view
 from .structure_from_motion import estimate_placement
 from .triangulation import triangulate
+from .which_way_up import PRECISE_PX, read_placement_that_fits
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,9 +43,18 @@ def solve_cameras(
     Files are written to workdir alone. The same seed gives the same cameras to the bit.
     Raises ReconstructionError: CAMERAS_UNUSABLE, NO_OVERLAP, NO_PARALLAX, TOO_FEW_PHOTOS, TOO_FEW_PLACED.
     """
+
+    def visibility_with(placement: Placement) -> Bool[np.ndarray, "points placed"]:
+        views = tuple(undistorted_view(photos[placed.index], placed) for placed in placement.placed)
+        _, visibility = triangulate(
+            views, workdir=workdir, seed=seed, progress=progress, largest_error_px=PRECISE_PX
+        )
+        return visibility
+
     photos, copies = _without_copies(photos) if given is None else (photos, ())
     if given is not None:
-        placement = _without_placed_copies(photos, read_placement(photos, given))
+        placement = read_placement_that_fits(photos, given, visibility_with)
+        placement = _without_placed_copies(photos, placement)
     else:
         placement = estimate_placement(
             photos,

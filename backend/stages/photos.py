@@ -152,8 +152,8 @@ def white_masks_text(photos: Sequence[Photo]) -> str:
     return f"The masks are white all over, so that they cut nothing out. {_WHITE_ON_BLACK}"
 
 
-def turned_text(photos: Sequence[Photo]) -> str:
-    """What to say of photographs with masks or cameras that may be of the files' own pixels.
+def turned_text(what: str, photos: Sequence[Photo]) -> str:
+    """What to say of photographs whose masks or cameras, which `what` tells, may be of the files' own pixels.
 
     Empty where EXIF turns none of them, or only such whose shape tells: those taken on their side.
     """
@@ -161,8 +161,8 @@ def turned_text(photos: Sequence[Photo]) -> str:
     if not names:
         return ""
     return (
-        f"EXIF asks to turn {first_names(names)}: masks and cameras are taken to be of what is then upright. "
-        "If they are not, save these photographs upright and make masks and cameras of them again."
+        f"EXIF asks to turn {first_names(names)}: their {what} are taken to be of what is then upright. "
+        f"If they are not, save these photographs upright and make {what} of them again."
     )
 
 

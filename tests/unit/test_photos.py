@@ -312,7 +312,7 @@ def test_masks_are_turned_with_their_photographs(orientation: int, mask_knows: b
     assert photo.exif_orientation == orientation
     if mask_knows or orientation == 1 or orientation >= 5:
         np.testing.assert_array_equal(photo.mask, photo.image_srgb[..., 0])
-    assert ("a.png" in turned_text([photo])) == (orientation in (2, 3, 4))
+    assert ("a.png" in turned_text("masks", [photo])) == (orientation in (2, 3, 4))
 
 
 def test_an_upright_mask_stays_so(tmp_path: Path) -> None:
