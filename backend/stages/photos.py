@@ -26,6 +26,7 @@ from ..wire.photographs import (
 )
 
 _WHITE_ON_BLACK = "Make the subject white and the rest black."
+_OPAQUE = "Make the subject opaque, or save the photograph without transparency."
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -194,8 +195,9 @@ def _load_photo(path: Path, name: str, mask_path: Path | None, config: PhotosCon
     else:
         mask = _load_mask(mask_path, name, decoded)
     if mask is not None and mask.max() == 0:
-        text = f"The mask of {name} is empty: it leaves nothing of the photograph."
-        raise ReconstructionError(ErrorCode.MASK_UNUSABLE, text, _WHITE_ON_BLACK)
+        what, remedy = ("mask", _WHITE_ON_BLACK) if mask_path else ("alpha channel", _OPAQUE)
+        text = f"The {what} of {name} is empty: it leaves nothing of the photograph."
+        raise ReconstructionError(ErrorCode.MASK_UNUSABLE, text, remedy)
     return Photo(
         name=name,
         path=path,

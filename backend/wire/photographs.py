@@ -77,11 +77,13 @@ def is_of_phone(path: Path) -> bool:
 def passed_over(sources: Sequence[Path]) -> tuple[str, ...]:
     """Names of the pictures among the sources, files or folders, that cannot be read.
 
-    Raises OSError where a folder cannot be read.
+    Those that lie beside a copy that can, IMG_1.CR2 beside IMG_1.JPG, are none. Raises OSError where a folder
+    cannot be read.
     """
-    members = (path for source in sources for path in (source.iterdir() if source.is_dir() else [source]))
-    found = (path for path in members if not is_readable(path) and _is_visible_file(path))
-    return tuple(sorted({path.name for path in found}))
+    members = [path for source in sources for path in (source.iterdir() if source.is_dir() else [source])]
+    copies = {path.with_suffix("") for path in members if path.suffix.lower() in SUFFIXES}
+    others = (path for path in members if not is_readable(path) and _is_visible_file(path))
+    return tuple(sorted({path.name for path in others if path.with_suffix("") not in copies}))
 
 
 def passed_over_text(names: Sequence[str]) -> str:

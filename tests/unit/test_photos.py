@@ -170,6 +170,14 @@ def test_alpha_alone_is_a_mask_also_of_what_fills_the_picture(tmp_path: Path) ->
     np.testing.assert_array_equal(mask > 0.5, alpha > 0)
 
 
+def test_a_photograph_that_is_transparent_all_over_is_told_as_such(tmp_path: Path) -> None:
+    for name in ["a.png", "b.png"]:
+        Image.new("LA", (40, 30), (100, 0)).save(tmp_path / name)
+    error = refusal([tmp_path])
+    assert "alpha channel of a.png is empty" in error.text
+    assert "opaque" in error.remedy
+
+
 def test_masks_of_a_kind_that_cannot_be_read_are_named(tmp_path: Path) -> None:
     photos = [write(tmp_path / name) for name in ["a.png", "b.png"]]
     write(tmp_path / "m" / "a_mask.gif")
