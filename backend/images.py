@@ -71,6 +71,9 @@ def read_image(path: Path, max_side_px: int | None = None) -> DecodedImage:
     small_width, small_height = fitted_size(width, height, max_side_px)
     pixels = resized(stored, small_width, small_height)
     pixels /= _largest_value(stored.dtype)
+    if np.issubdtype(stored.dtype, np.floating) and np.median(pixels) > 1.0:
+        text = f"Most of {path.name} is brighter than white: its values are floating point numbers beyond 1."
+        raise ReconstructionError(ErrorCode.PHOTO_UNREADABLE, text, "Save it with 8 or 16 bits a colour.")
     np.clip(pixels, 0.0, 1.0, out=pixels)
     return DecodedImage(
         image_srgb=_three_channels(pixels),

@@ -191,6 +191,18 @@ def test_inks_of_sixteen_bits_are_read_as_colour(tmp_path: Path) -> None:
     assert read.mask is None, "black ink is no alpha"
 
 
+def test_floating_point_numbers_are_from_black_to_white(noise: np.ndarray, tmp_path: Path) -> None:
+    """Some programs write 0 to 255; a few lights beyond white are lights."""
+    values = noise.astype(np.float32) / 255
+    values[0, 0] = 20
+    tifffile.imwrite(tmp_path / "a.tif", values, photometric="rgb")
+    np.testing.assert_allclose(read_image(tmp_path / "a.tif").image_srgb, np.minimum(values, 1), atol=1e-6)
+    tifffile.imwrite(tmp_path / "b.tif", noise.astype(np.float32), photometric="rgb")
+    with pytest.raises(ReconstructionError, match=r"Most of b.tif is brighter than white") as raised:
+        read_image(tmp_path / "b.tif")
+    assert raised.value.remedy
+
+
 def test_sixteen_bits_are_kept(noise: np.ndarray, tmp_path: Path) -> None:
     deep = noise.astype(np.uint16) * 256 + 77
     tifffile.imwrite(tmp_path / "colour.tif", deep, photometric="rgb")
