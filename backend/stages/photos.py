@@ -26,6 +26,8 @@ from ..wire.photographs import (
 )
 
 _WHITE_ON_BLACK = "Make the subject white and the rest black."
+_ALONG_EDGES = 0.95
+"""Of the edges of every photograph: the masks of walls and floors reach them too, but end somewhere."""
 _OPAQUE = "Make the subject opaque, or save the photograph without transparency."
 
 
@@ -146,11 +148,16 @@ def without_masks_text(names: Sequence[str]) -> str:
 
 
 def white_masks_text(photos: Sequence[Photo]) -> str:
-    """What to say of masks that cut nothing out of any photograph; empty where some do, or there are none."""
+    """What to say of masks that cut nothing out of any photograph, or all the middle; empty without such."""
     masks = [photo.mask for photo in photos if photo.mask is not None]
-    if not masks or any((mask <= 0.5).any() for mask in masks):
+    if not masks or any(_share_along_edges(mask) <= _ALONG_EDGES for mask in masks):
         return ""
-    return f"The masks are white all over, so that they cut nothing out. {_WHITE_ON_BLACK}"
+    if not any((mask <= 0.5).any() for mask in masks):
+        return f"The masks are white all over, so that they cut nothing out. {_WHITE_ON_BLACK}"
+    return (
+        "The masks are white along all edges of the photographs and black inside, "
+        f"as if they were of the background. {_WHITE_ON_BLACK}"
+    )
 
 
 def turned_text(what: str, photos: Sequence[Photo]) -> str:
@@ -216,13 +223,17 @@ def is_outline(alpha: Float32[np.ndarray, "height width"]) -> bool:
     One that is opaque along most of a frame just inside the picture only marks pixels that hold nothing,
     as undistortion and stitching leave them at the edges.
     """
+    return _share_along_edges(alpha) < 0.5
+
+
+def _share_along_edges(alpha: Float32[np.ndarray, "height width"]) -> float:
+    """Of a frame just inside the picture, what is opaque or white; 0 where there is no inside."""
     height, width = alpha.shape
     inset = max(1, round(0.04 * min(height, width)))
     inner = alpha[inset : height - inset, inset : width - inset] > 0.5
     if min(inner.shape, default=0) < 2:
-        return True
-    frame = np.concatenate([inner[0], inner[-1], inner[:, 0], inner[:, -1]])
-    return bool(frame.mean() < 0.5)
+        return 0.0
+    return float(np.concatenate([inner[0], inner[-1], inner[:, 0], inner[:, -1]]).mean())
 
 
 def _load_mask(path: Path, photo_name: str, photo: DecodedImage) -> Float32[np.ndarray, "height width"]:

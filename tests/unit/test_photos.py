@@ -213,6 +213,21 @@ def test_masks_that_cut_nothing_out_are_told(tmp_path: Path) -> None:
     assert white_masks_text(load([tmp_path], tmp_path / "white")) == ""
 
 
+def test_inverted_masks_are_told(tmp_path: Path) -> None:
+    subject = np.zeros((30, 40), np.uint8)
+    subject[10:20, 10:30] = 255
+    facade = np.full_like(subject, 255)
+    facade[:4] = 0
+    (tmp_path / "m").mkdir()
+    for name in ["a.png", "b.png"]:
+        write(tmp_path / name)
+        Image.fromarray(255 - subject).save(tmp_path / "m" / name)
+    assert "of the background" in white_masks_text(load([tmp_path], tmp_path / "m"))
+    for right in (subject, facade):
+        Image.fromarray(right).save(tmp_path / "m" / "b.png")
+        assert white_masks_text(load([tmp_path], tmp_path / "m")) == ""
+
+
 def test_unusable_masks_are_refused(tmp_path: Path) -> None:
     photos = [write(tmp_path / name) for name in ["a.png", "b.png"]]
     write(tmp_path / "shape" / "a.png", 40, 40, level=255)
