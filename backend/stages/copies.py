@@ -17,7 +17,7 @@ _SAME_PLACE = 0.01
 """Of the largest distance between cameras. Pictures of a turned vase are the same from all around it."""
 
 
-def originals_of_copies(photos: Sequence[Photo] | Sequence[View]) -> dict[int, int]:
+def originals_of_copies(photos: Sequence[Photo | View]) -> dict[int, int]:
     """By the index of each photograph with the same pixels as an earlier one, the index of the first such.
 
     Evenly coloured ones are no copies: they show nothing at all.
