@@ -1,8 +1,9 @@
 """Image files as arrays: upright, scaled to [0, 1], with what the file knows about the lens.
 
-Arrays are [row, column, channel]; values are encoded as sRGB (no colour profile is applied).
+Arrays are [row, column, channel]; values are encoded as sRGB.
 """
 
+import io
 import math
 import warnings
 from collections.abc import Iterator
@@ -13,7 +14,7 @@ from typing import Any, NoReturn
 import numpy as np
 import tifffile
 from jaxtyping import Float, Float32, Shaped
-from PIL import ExifTags, Image, UnidentifiedImageError
+from PIL import ExifTags, Image, ImageCms, UnidentifiedImageError
 from pillow_heif import register_heif_opener
 from scipy.sparse import csr_array
 
@@ -60,7 +61,8 @@ def read_image(path: Path, max_side_px: int | None = None) -> DecodedImage:
     """The photograph in a file, upright, its longer side at most max_side_px.
 
     JPEG, HEIC, PNG, TIFF, WebP and BMP; grey, grey with alpha, palette, RGB, RGBA and CMYK; 8 and 16 bits
-    a channel (of colour PNG with 16 bits the upper 8 are used).
+    a channel (of colour PNG with 16 bits the upper 8 are used). A colour profile is applied, as phones'
+    Display P3, but to grey and to TIFF of 16 bits.
     Raises ReconstructionError(PHOTO_UNREADABLE).
     """
     stored, focal_px, exif_orientation = _decoded(path)
@@ -69,6 +71,9 @@ def read_image(path: Path, max_side_px: int | None = None) -> DecodedImage:
     small_width, small_height = fitted_size(width, height, max_side_px)
     pixels = resized(stored, small_width, small_height)
     pixels /= _largest_value(stored.dtype)
+    if np.issubdtype(stored.dtype, np.floating) and np.median(pixels) > 1.0:
+        text = f"Most of {path.name} is brighter than white: its values are floating point numbers beyond 1."
+        raise ReconstructionError(ErrorCode.PHOTO_UNREADABLE, text, "Save it with 8 or 16 bits a colour.")
     np.clip(pixels, 0.0, 1.0, out=pixels)
     return DecodedImage(
         image_srgb=_three_channels(pixels),
@@ -167,7 +172,7 @@ def _decoded(path: Path) -> tuple[Shaped[np.ndarray, "height width *channels"], 
             exif = file.getexif()
             focal_px = focal_px_or_none(exif, *file.size)
             deep = _deep_colour_or_none(path) if file.format == "TIFF" else None
-            pixels = np.asarray(_plain_mode(file)) if deep is None else deep
+            pixels = np.asarray(_in_srgb(file)) if deep is None else deep
             orientation = exif.get(ExifTags.Base.Orientation, 1)
             return pixels, focal_px, orientation if orientation in range(1, 9) else 1
     except UnidentifiedImageError as error:
@@ -186,17 +191,31 @@ def _decoded(path: Path) -> tuple[Shaped[np.ndarray, "height width *channels"], 
 def _deep_colour_or_none(path: Path) -> Shaped[np.ndarray, "height width channels"] | None:
     """Pixels of a TIFF with more than 8 bits a colour, which Pillow cuts to 8 or does not know.
 
-    None where it is none such, or compressed in a way that only Pillow can undo.
+    None where it is none such, as of inks, or compressed in a way that only Pillow can undo.
     """
     try:
         with tifffile.TiffFile(path) as file:
             page = file.pages.first
-            if page.bitspersample <= 8 or page.samplesperpixel < 3:
+            if page.bitspersample <= 8 or page.photometric != tifffile.PHOTOMETRIC.RGB:
                 return None
             pixels = np.asarray(page.asarray())
     except (ValueError, tifffile.TiffFileError):
         return None
     return np.moveaxis(pixels, 0, -1) if page.planarconfig == tifffile.PLANARCONFIG.SEPARATE else pixels
+
+
+def _in_srgb(file: Image.Image) -> Image.Image:
+    """The image in a plain mode, its colours taken from the file's own profile to sRGB where it has one."""
+    plain = _plain_mode(file)
+    coloured = file if file.mode == "CMYK" else plain
+    profile = file.info.get("icc_profile")
+    if not profile or coloured.mode not in ("RGB", "RGBA", "CMYK"):
+        return plain
+    try:
+        own, srgb = ImageCms.ImageCmsProfile(io.BytesIO(profile)), ImageCms.createProfile("sRGB")
+        return ImageCms.profileToProfile(coloured, own, srgb, outputMode=plain.mode) or plain
+    except (OSError, ImageCms.PyCMSError):
+        return plain  # a damaged profile, or one of other colours than the file's
 
 
 def _plain_mode(file: Image.Image) -> Image.Image:

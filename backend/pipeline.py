@@ -30,6 +30,7 @@ from .stages.camera_refinement import match_solved, with_refined
 from .stages.camera_report import build_camera_report
 from .stages.cameras import solve_cameras
 from .stages.confirmation import unconfirmed
+from .stages.copies import copies_apart_text
 from .stages.disagreement import disagreement
 from .stages.known_cameras import cameras_source, may_be_unturned
 from .stages.mesh import extract_mesh
@@ -51,6 +52,7 @@ from .stages.region import find_region
 from .stages.report import Report, ReportInputs, StageTiming, build_report
 from .stages.surface import Surface
 from .stages.train import TrainConfig, fit_surface
+from .stages.which_way_up import WHICH_WAY_UP
 from .wire.photographs import passed_over, passed_over_text
 from .workspace import StageCost, Workspace, check_free_space, content_of, fingerprint
 
@@ -291,7 +293,8 @@ def _placed(
     job: Job, files: _Files, this: _Run, settings: Settings, stages: Stages
 ) -> tuple[SolvedCameras, Region]:
     """Where each photograph was taken, and what of the world is to be reconstructed."""
-    if text := passed_over_text(passed_over([source for source in job.images if source.is_dir()])):
+    sources = job.images if job.masks is None else (*job.images, job.masks)
+    if text := passed_over_text(passed_over(sources)):
         this.warn(text)
     if not job.masks and (text := unused_masks_text(job.images)):
         this.warn(text)
@@ -302,14 +305,18 @@ def _placed(
         this.warn(without_masks_text(bare))
     if text := white_masks_text(photos):
         this.warn(text)
-    cameras_in_doubt = job.cameras is not None and may_be_unturned(job.cameras)
-    doubtful = [photo for photo in photos if cameras_in_doubt or photo.name in files.mask_contents]
-    if text := turned_text(doubtful):
+    if text := turned_text("masks", [photo for photo in photos if photo.name in files.mask_contents]):
         this.warn(text)
     scratch = {"workdir": this.workspace.emptied_sfm_folder(), "seed": job.seed}
     solve = partial(stages.solve_cameras, photos, job.cameras, settings.cameras, **scratch)
     solved = this.stage("cameras", solve)
+    is_known = any(decision.what == WHICH_WAY_UP for decision in solved.decisions)
+    in_doubt = job.cameras is not None and may_be_unturned(job.cameras) and not is_known
+    if in_doubt and (text := turned_text("cameras", photos)):
+        this.warn(text)
     _warn_of_unplaced(solved, len(photos), this)
+    if text := copies_apart_text(solved.views):
+        this.warn(text)
     if doubt := unconfirmed(solved):
         this.warn(doubt)
     del photos, solve  # the views hold what is needed of them

@@ -28,7 +28,8 @@ def disagreement(solved: SolvedCameras, stereo: StereoResult) -> tuple[str, ...]
         texts.append(
             "The cameras that were given do not fit the photographs: patches of surface lie "
             f"{beside_px:.2g} px beside where these cameras see them, and the shape is wrong by it. "
-            "Check positions, directions and focal lengths in the cameras file, or let FewView find them."
+            "Check positions, directions and focal lengths in the cameras file, or let FewView find them; "
+            "a subject that was moved between photographs, but not its surroundings, looks the same."
         )
     return tuple(texts)
 

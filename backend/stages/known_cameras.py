@@ -31,16 +31,18 @@ _NOTHING: Mapping[int, str] = MappingProxyType({})
 _CHECK = "Check that the cameras belong to these photographs."
 
 
-def read_placement(photos: Sequence[Photo], given: Path) -> Placement:
+def read_placement(photos: Sequence[Photo], given: Path, *, as_stored: bool = False) -> Placement:
     """The cameras in a transforms.json, a COLMAP model, or the folder of one or of a finished run.
 
     Cameras and photographs are matched by file name; photographs without a camera are not placed. COLMAP does
     not look at the EXIF orientation, so cameras of a model are turned with their photographs; those of a
-    transforms.json only where they would not fit else.
+    transforms.json only where they would not fit else, or `as_stored` says that they are of stored pixels.
     Raises ReconstructionError(CAMERAS_UNUSABLE).
     """
     source = cameras_source(given)
-    return _from_model(photos, source) if source.is_dir() else _from_transforms(photos, source)
+    if source.is_dir():
+        return _from_model(photos, source)
+    return _from_transforms(photos, source, as_stored=as_stored)
 
 
 def read_cameras(given: Path) -> tuple[tuple[str, Camera], ...]:
@@ -164,7 +166,7 @@ def cameras_source(given: Path) -> Path:
     )
 
 
-def _from_transforms(photos: Sequence[Photo], path: Path) -> Placement:
+def _from_transforms(photos: Sequence[Photo], path: Path, *, as_stored: bool) -> Placement:
     frames = read_frames(path)
     estimate = estimate_or_none(frames)
     why = _why_unplaced(photos, estimate)
@@ -176,7 +178,7 @@ def _from_transforms(photos: Sequence[Photo], path: Path) -> Placement:
         # exact before it is inverted: far from the origin the position keeps its digits, not the rotation's
         pose = checked_pose(world_from_camera(frame, photo.name), photo.name)
         read.append(PlacedPhoto(index=index, lens=lens, camera_from_world=np.linalg.inv(pose)))
-    placed, decisions = _upright(photos, read, path, as_stored=False)
+    placed, decisions = _upright(photos, read, path, as_stored=as_stored)
     columns = [number for _, number in sorted(matched.items())]
     positions, visibility = np.zeros((0, 3)), np.zeros((0, len(placed)), bool)
     if estimate is not None:

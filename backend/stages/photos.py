@@ -13,15 +13,22 @@ from ..images import DecodedImage, read_image, resized, same_shape, upright
 from ..scene import Photo, Progress
 from ..wire.photographs import (
     KINDS,
+    MASK_ENDINGS,
     first_names,
+    is_readable,
     masks_among,
     names_of,
+    passed_over,
+    passed_over_text,
     photographs_in,
     pictures_in,
     spelling,
 )
 
 _WHITE_ON_BLACK = "Make the subject white and the rest black."
+_ALONG_EDGES = 0.95
+"""Of the edges of every photograph: the masks of walls and floors reach them too, but end somewhere."""
+_OPAQUE = "Make the subject opaque, or save the photograph without transparency."
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,7 +69,8 @@ def named_photos(sources: Sequence[Path]) -> dict[str, Path]:
 def find_photos(sources: Sequence[Path]) -> list[Path]:
     """Photographs among the sources, each once, in natural order; of a folder its visible image files.
 
-    Masks of the others, as a_mask.png beside a.jpg, are none.
+    Masks of the others, as a_mask.png beside a.jpg, are none. Nor are files of kinds that cannot be read:
+    of a raw photograph it would be the thumbnail.
     """
     found: dict[Path, Path] = {}
     for source in sources:
@@ -71,21 +79,24 @@ def find_photos(sources: Sequence[Path]) -> list[Path]:
                 ErrorCode.NO_PHOTOS, f"There is no file or folder {source}.", "Check the path."
             )
         members = photographs_in(source) if source.is_dir() else [source]
-        found.update({path.resolve(): path for path in members})
+        found.update({path.resolve(): path for path in members if is_readable(path)})
     masks = masks_among(found.values())
     found = {place: path for place, path in found.items() if path not in masks}
+    skipped = passed_over_text(passed_over(sources))
     if not found:
         places = ", ".join(str(source) for source in sources) or "the list"
         text = f"There are no photographs in {places}."
         raise ReconstructionError(
-            ErrorCode.NO_PHOTOS, text, f"Give a folder with photographs: {KINDS} can be read."
+            ErrorCode.NO_PHOTOS,
+            text,
+            skipped or f"Give a folder with photographs: {KINDS} can be read.",
         )
     if len(found) == 1:
         text = "There is only one photograph."
         raise ReconstructionError(
             ErrorCode.TOO_FEW_PHOTOS,
             text,
-            "Take at least two, or better three or more, from different places.",
+            skipped or "Take at least two, or better three or more, from different places.",
         )
     return sorted(found.values(), key=lambda path: (natural_order(path.name), str(path)))
 
@@ -99,8 +110,9 @@ def natural_order(name: str) -> tuple[tuple[int, int, str], ...]:
 def match_masks(photos: Mapping[str, Path], masks_folder: Path) -> dict[str, Path]:
     """The mask file of each photograph that has one, by the photograph's name.
 
-    For a.jpg: a.jpg_mask.png, a.jpg.png, a_mask.png or a.png, in any image format and letter case; the first
-    of these that there is. No photograph is a mask, and no mask that of two photographs.
+    For a.jpg: a.jpg_mask.png, a.jpg.mask.png, a.jpg.png, a_mask.png, a.mask.png or a.png, in any image
+    format and letter case; the first of these that there is. No photograph is a mask, and no mask that of
+    two photographs.
     Raises ReconstructionError(MASK_UNUSABLE).
     """
     if not masks_folder.is_dir():
@@ -112,7 +124,7 @@ def match_masks(photos: Mapping[str, Path], masks_folder: Path) -> dict[str, Pat
     photo_of: dict[Path, str] = {}
     for name in photos:
         base = Path(name)
-        stems = (f"{base.name}_mask", base.name, f"{base.stem}_mask", base.stem)
+        stems = [own + ending for own in (base.name, base.stem) for ending in (*MASK_ENDINGS, "")]
         mask = next((by_stem[spelling(stem)] for stem in stems if spelling(stem) in by_stem), None)
         if mask in photo_of:
             text = f"The mask {mask.name} could be that of {photo_of[mask]} or of {name}."
@@ -122,7 +134,8 @@ def match_masks(photos: Mapping[str, Path], masks_folder: Path) -> dict[str, Pat
             photo_of[mask] = name
     if not photo_of:
         text = f"No mask in {masks_folder} is named like a photograph."
-        raise ReconstructionError(ErrorCode.MASK_UNUSABLE, text, _naming_text(next(iter(photos))))
+        remedy = passed_over_text(passed_over([masks_folder])) or _naming_text(next(iter(photos)))
+        raise ReconstructionError(ErrorCode.MASK_UNUSABLE, text, remedy)
     return {name: mask for mask, name in photo_of.items()}
 
 
@@ -135,15 +148,20 @@ def without_masks_text(names: Sequence[str]) -> str:
 
 
 def white_masks_text(photos: Sequence[Photo]) -> str:
-    """What to say of masks that cut nothing out of any photograph; empty where some do, or there are none."""
+    """What to say of masks that cut nothing out of any photograph, or all the middle; empty without such."""
     masks = [photo.mask for photo in photos if photo.mask is not None]
-    if not masks or any((mask <= 0.5).any() for mask in masks):
+    if not masks or any(_share_along_edges(mask) <= _ALONG_EDGES for mask in masks):
         return ""
-    return f"The masks are white all over, so that they cut nothing out. {_WHITE_ON_BLACK}"
+    if not any((mask <= 0.5).any() for mask in masks):
+        return f"The masks are white all over, so that they cut nothing out. {_WHITE_ON_BLACK}"
+    return (
+        "The masks are white along all edges of the photographs and black inside, "
+        f"as if they were of the background. {_WHITE_ON_BLACK}"
+    )
 
 
-def turned_text(photos: Sequence[Photo]) -> str:
-    """What to say of photographs with masks or cameras that may be of the files' own pixels.
+def turned_text(what: str, photos: Sequence[Photo]) -> str:
+    """What to say of photographs whose masks or cameras, which `what` tells, may be of the files' own pixels.
 
     Empty where EXIF turns none of them, or only such whose shape tells: those taken on their side.
     """
@@ -151,8 +169,8 @@ def turned_text(photos: Sequence[Photo]) -> str:
     if not names:
         return ""
     return (
-        f"EXIF asks to turn {first_names(names)}: masks and cameras are taken to be of what is then upright. "
-        "If they are not, save these photographs upright and make masks and cameras of them again."
+        f"EXIF asks to turn {first_names(names)}: their {what} are taken to be of what is then upright. "
+        f"If they are not, save these photographs upright and make {what} of them again."
     )
 
 
@@ -184,8 +202,9 @@ def _load_photo(path: Path, name: str, mask_path: Path | None, config: PhotosCon
     else:
         mask = _load_mask(mask_path, name, decoded)
     if mask is not None and mask.max() == 0:
-        text = f"The mask of {name} is empty: it leaves nothing of the photograph."
-        raise ReconstructionError(ErrorCode.MASK_UNUSABLE, text, _WHITE_ON_BLACK)
+        what, remedy = ("mask", _WHITE_ON_BLACK) if mask_path else ("alpha channel", _OPAQUE)
+        text = f"The {what} of {name} is empty: it leaves nothing of the photograph."
+        raise ReconstructionError(ErrorCode.MASK_UNUSABLE, text, remedy)
     return Photo(
         name=name,
         path=path,
@@ -204,13 +223,17 @@ def is_outline(alpha: Float32[np.ndarray, "height width"]) -> bool:
     One that is opaque along most of a frame just inside the picture only marks pixels that hold nothing,
     as undistortion and stitching leave them at the edges.
     """
+    return _share_along_edges(alpha) < 0.5
+
+
+def _share_along_edges(alpha: Float32[np.ndarray, "height width"]) -> float:
+    """Of a frame just inside the picture, what is opaque or white; 0 where there is no inside."""
     height, width = alpha.shape
     inset = max(1, round(0.04 * min(height, width)))
     inner = alpha[inset : height - inset, inset : width - inset] > 0.5
     if min(inner.shape, default=0) < 2:
-        return True
-    frame = np.concatenate([inner[0], inner[-1], inner[:, 0], inner[:, -1]])
-    return bool(frame.mean() < 0.5)
+        return 0.0
+    return float(np.concatenate([inner[0], inner[-1], inner[:, 0], inner[:, -1]]).mean())
 
 
 def _load_mask(path: Path, photo_name: str, photo: DecodedImage) -> Float32[np.ndarray, "height width"]:
@@ -240,7 +263,13 @@ def _has_shape(values: Float32[np.ndarray, "_ _"], width: int, height: int) -> b
 
 
 def _mask_values(decoded: DecodedImage) -> Float32[np.ndarray, "height width"]:
-    """The alpha channel, or else the brightness; 1 where it is largest: some tools write 1 of 255."""
-    values = decoded.image_srgb.mean(axis=2) if decoded.mask is None else decoded.mask
+    """An alpha channel that cuts out a subject, or else the brightness; 1 where it is largest.
+
+    Some tools write 1 of 255; some leave an alpha channel that cuts out nothing, or all, beside a mask in
+    colours. Where those are even, as of a subject before nothing, alpha counts whatever it cuts out.
+    """
+    brightness, alpha = decoded.image_srgb.mean(axis=2), decoded.mask
+    is_cut_out = alpha is not None and is_outline(alpha) and alpha.max() > 0.5
+    values = alpha if alpha is not None and (is_cut_out or np.ptp(brightness) == 0) else brightness
     largest = float(values.max())
     return values if largest == 0 else (values / largest).astype(np.float32)

@@ -26,7 +26,12 @@ _SMALLEST_ANGLE_DEG = 1.5
 
 
 def triangulate(
-    views: tuple[View, ...], *, workdir: Path, seed: int, progress: Progress
+    views: tuple[View, ...],
+    *,
+    workdir: Path,
+    seed: int,
+    progress: Progress,
+    largest_error_px: float = _LARGEST_ERROR_PX,
 ) -> tuple[Float64[np.ndarray, "points 3"], Bool[np.ndarray, "points views"]]:
     """Positions (world frame) of features that two views share, and by which views.
 
@@ -48,22 +53,24 @@ def triangulate(
     register_pictures(database, folder, groups)
     extract_features(database, folder, groups, _NUM_FEATURES, sensitive=False, progress=progress)
     match_pictures(database, sensitive=False, guided=False, seed=seed)
-    return _points_of_pairs(database, cameras)
+    return _points_of_pairs(database, cameras, largest_error_px)
 
 
 def _points_of_pairs(
-    database: Path, cameras: list[Camera]
+    database: Path, cameras: list[Camera], largest_error_px: float
 ) -> tuple[Float64[np.ndarray, "points 3"], Bool[np.ndarray, "points views"]]:
     positions, visibility = [np.zeros((0, 3))], [np.zeros((0, len(cameras)), bool)]
     with pycolmap.Database.open(database) as opened:
         ids = {picture_index(image.name): image.image_id for image in opened.read_all_images()}
-        pixels = {i: np.asarray(opened.read_keypoints(ids[i]))[:, :2] for i in range(len(cameras))}
+        pixels = {
+            i: np.asarray(opened.read_keypoints(ids[i]), np.float64)[:, :2] for i in range(len(cameras))
+        }
         for i in range(len(cameras)):
             for j in range(i + 1, len(cameras)):
                 matches = np.asarray(opened.read_two_view_geometry(ids[i], ids[j]).inlier_matches)
                 if len(matches):
                     first, second = pixels[i][matches[:, 0]], pixels[j][matches[:, 1]]
-                    points, good = two_view_points(cameras[i], cameras[j], first, second)
+                    points, good = two_view_points(cameras[i], cameras[j], first, second, largest_error_px)
                     seen = np.zeros((int(good.sum()), len(cameras)), bool)
                     seen[:, [i, j]] = True
                     positions.append(points[good])
@@ -72,7 +79,11 @@ def _points_of_pairs(
 
 
 def two_view_points(
-    a: Camera, b: Camera, pixels_a: Float64[np.ndarray, "points 2"], pixels_b: Float64[np.ndarray, "points 2"]
+    a: Camera,
+    b: Camera,
+    pixels_a: Float64[np.ndarray, "points 2"],
+    pixels_b: Float64[np.ndarray, "points 2"],
+    largest_error_px: float = _LARGEST_ERROR_PX,
 ) -> tuple[Float64[np.ndarray, "points 3"], Bool[np.ndarray, "points"]]:
     """The middle of the shortest line between two rays (world frame), and where that is a point.
 
@@ -91,7 +102,7 @@ def two_view_points(
     good = (along_a > 0) & (along_b > 0)
     # else it is no point anyway: cameras in one place have all of them at 0
     far_a, far_b = np.where(good, along_a, 1.0), np.where(good, along_b, 1.0)
-    good &= np.maximum(gap * a.fx_px / far_a, gap * b.fx_px / far_b) < _LARGEST_ERROR_PX
+    good &= np.maximum(gap * a.fx_px / far_a, gap * b.fx_px / far_b) < largest_error_px
     good &= sine2 > np.sin(np.deg2rad(_SMALLEST_ANGLE_DEG)) ** 2
     return (on_a + on_b) / 2, good
 

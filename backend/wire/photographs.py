@@ -8,15 +8,32 @@ from collections.abc import Collection, Sequence
 from pathlib import Path, PurePosixPath
 
 _OF_PHONES = (".heic", ".heif")
-SUFFIXES = (".jpg", ".jpeg", *_OF_PHONES, ".png", ".tif", ".tiff", ".webp", ".bmp")
+SUFFIXES = (".jpg", ".jpeg", ".jfif", *_OF_PHONES, ".png", ".tif", ".tiff", ".webp", ".bmp")
 """Of files that can be read, in small letters."""
 KINDS = "JPEG, HEIC, PNG, TIFF, WebP and BMP"
 """The same in words."""
 _OTHER_SUFFIXES = frozenset(
     {".avif", ".jxl", ".jp2", ".gif", ".exr", ".hdr", ".psd"}
-    | {".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2"}
+    | {
+        ".dng",
+        ".cr2",
+        ".cr3",
+        ".nef",
+        ".nrw",
+        ".arw",
+        ".raf",
+        ".orf",
+        ".rw2",
+        ".pef",
+        ".srw",
+        ".x3f",
+        ".3fr",
+        ".iiq",
+    }
 )
 """Of pictures that cannot: phones and cameras write some of them beside those above."""
+MASK_ENDINGS = ("_mask", ".mask")
+"""Of a mask's name before its extension, as Metashape and RealityScan write them."""
 
 
 def photographs_in(folder: Path) -> list[Path]:
@@ -41,10 +58,15 @@ def pictures_in(folder: Path) -> list[Path]:
 
 
 def masks_among(paths: Collection[Path]) -> list[Path]:
-    """Those that are named as masks of others: a_mask.png or a.jpg_mask.png where there is an a.jpg."""
+    """Those that are named as masks of others: as a_mask.png or a.jpg.mask.png where there is an a.jpg."""
     named = {spelling(name) for path in paths for name in (path.stem, path.name)}
-    stems = ((path, spelling(path.stem)) for path in paths)
-    return [path for path, stem in stems if stem.endswith("_mask") and stem.removesuffix("_mask") in named]
+    masks = {name + ending for name in named for ending in MASK_ENDINGS}
+    return [path for path in paths if spelling(path.stem) in masks]
+
+
+def is_readable(path: Path) -> bool:
+    """Whether its name does not say that it is a picture of a kind that cannot be read."""
+    return path.suffix.lower() not in _OTHER_SUFFIXES
 
 
 def is_of_phone(path: Path) -> bool:
@@ -55,11 +77,13 @@ def is_of_phone(path: Path) -> bool:
 def passed_over(sources: Sequence[Path]) -> tuple[str, ...]:
     """Names of the pictures among the sources, files or folders, that cannot be read.
 
-    Raises OSError where a folder cannot be read.
+    Those that lie beside a copy that can, IMG_1.CR2 beside IMG_1.JPG, are none. Raises OSError where a folder
+    cannot be read.
     """
-    members = (path for source in sources for path in (source.iterdir() if source.is_dir() else [source]))
-    found = (path for path in members if path.suffix.lower() in _OTHER_SUFFIXES and _is_visible_file(path))
-    return tuple(sorted({path.name for path in found}))
+    members = [path for source in sources for path in (source.iterdir() if source.is_dir() else [source])]
+    copies = {path.with_suffix("") for path in members if path.suffix.lower() in SUFFIXES}
+    others = (path for path in members if not is_readable(path) and _is_visible_file(path))
+    return tuple(sorted({path.name for path in others if path.with_suffix("") not in copies}))
 
 
 def passed_over_text(names: Sequence[str]) -> str:

@@ -18,6 +18,7 @@ from backend.errors import ErrorCode, ReconstructionError
 from backend.mesh_files import write_sparse
 from backend.scene import Photo, Region, SolvedCameras, Unplaced, no_progress, to_unit_sphere
 from backend.stages.cameras import CamerasConfig, solve_cameras
+from backend.stages.copies import copies_apart_text
 from backend.stages.known_cameras import checked_pose, match_by_name, read_cameras
 from backend.stages.nerfstudio import OPENCV_FROM_OPENGL, frame_lens, transforms_json
 from tests.lens_models import LENSES
@@ -340,6 +341,52 @@ def test_a_photograph_without_a_camera_is_left_out(tmp_path: Path) -> None:
     solved = solve_frames(PHOTOS, {"frames": [FRAMES[2], FRAMES[0]]}, tmp_path)
     assert [view.name for view in solved.views] == ["a.jpg", "c.jpg"]
     assert solved.unplaced == (Unplaced(name="b.jpg", why="no camera in transforms.json has its name"),)
+
+
+def test_a_copy_with_the_same_camera_is_left_out(tmp_path: Path) -> None:
+    """It would weigh twice, and pass for one more photograph that confirms the others."""
+    copy = replace(PHOTOS[1], name="x.jpg", path=Path("photos/x.jpg"))
+    frames = [*FRAMES, make_frame("x.jpg", 2)]
+    solved = solve_frames([*PHOTOS, copy], {"frames": frames}, tmp_path)
+    assert [view.name for view in solved.views] == ["a.jpg", "b.jpg", "c.jpg"]
+    assert solved.unplaced == (Unplaced(name="x.jpg", why="it is a copy of b.jpg"),)
+    assert solved.sparse_visibility.shape == (0, 3)
+    with pytest.raises(ReconstructionError, match="All 2 photographs are copies of one") as raised:
+        solve_frames([PHOTOS[1], copy], {"frames": frames}, tmp_path)
+    assert raised.value.code == ErrorCode.TOO_FEW_PHOTOS
+
+
+def test_points_that_a_photograph_and_its_copy_alone_see_are_none(tmp_path: Path) -> None:
+    found = estimated_before(tmp_path)
+    photos = [PHOTOS[0], PHOTOS[1], replace(PHOTOS[0], name="x.jpg", path=Path("photos/x.jpg"))]
+    frames = [make_frame("a.jpg", 1), make_frame("b.jpg", 2), make_frame("x.jpg", 1)]
+    content = {"frames": frames, "fewview": transforms_json(found, REGION)["fewview"]}
+    content["fewview"]["unplaced"] = []
+    (tmp_path / "cameras.json").write_text(json.dumps(content))
+    seen, colours = np.ones((30, 3), bool), np.zeros((30, 3), np.uint8)
+    seen[:10, 1] = False
+    points = found.sparse_positions
+    write_sparse(tmp_path / "sparse.ply", positions=points, colours_srgb=colours, visibility=seen)
+    solved = solve(photos, tmp_path / "cameras.json", tmp_path)
+    assert [one.name for one in solved.unplaced] == ["x.jpg"]
+    np.testing.assert_array_equal(solved.sparse_positions, points[10:])
+    assert solved.sparse_visibility.shape == (20, 2)
+
+
+def test_a_copy_that_has_the_camera_alone_stays(tmp_path: Path) -> None:
+    copy = replace(PHOTOS[2], name="c (1).jpg", path=Path("photos/c (1).jpg"))
+    solved = solve_frames([*PHOTOS[:2], copy, PHOTOS[2]], {"frames": FRAMES}, tmp_path)
+    assert [view.name for view in solved.views] == ["a.jpg", "b.jpg", "c.jpg"]
+    assert [one.name for one in solved.unplaced] == ["c (1).jpg"]
+
+
+def test_the_same_picture_of_cameras_that_stand_apart_is_told(tmp_path: Path) -> None:
+    """As of a turned vase, or where a file was copied under another's name: which is right is not known."""
+    copy = replace(PHOTOS[1], name="c.jpg", path=Path("photos/c.jpg"))
+    solved = solve_frames([*PHOTOS[:2], copy], {"frames": FRAMES}, tmp_path)
+    assert [view.name for view in solved.views] == ["a.jpg", "b.jpg", "c.jpg"]
+    assert "b.jpg and c.jpg are the same picture" in copies_apart_text(solved.views)
+    assert copies_apart_text(solve_frames(PHOTOS, {"frames": FRAMES}, tmp_path).views) == ""
 
 
 def test_names_match_by_case_stem_and_folder() -> None:

@@ -54,6 +54,7 @@ def test_a_camera_that_stands_elsewhere_is_told() -> None:
     moved = replace(second, camera_from_world=second.camera_from_world @ np.linalg.inv(orbit))
     (text,) = told([first, moved, *others])
     assert text.startswith("The cameras that were given do not fit the photographs")
+    assert "moved between photographs" in text, "its outlines and texture say so too"
 
 
 def test_focal_lengths_that_are_wrong_are_told() -> None:

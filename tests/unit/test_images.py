@@ -8,7 +8,7 @@ import pytest
 import tifffile
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from PIL import ExifTags, Image, ImageOps
+from PIL import ExifTags, Image, ImageCms, ImageOps
 
 from backend.errors import ErrorCode, ReconstructionError
 from backend.images import (
@@ -151,6 +151,56 @@ def test_cmyk_jpeg_is_read_as_colour(tmp_path: Path) -> None:
     np.testing.assert_allclose(
         read_image(tmp_path / "a.jpg").image_srgb[8, 8], [1, 0, 0], atol=0.03, err_msg="no cyan: red"
     )
+
+
+def _with_red_and_green_exchanged() -> bytes:
+    """sRGB's colour profile but for its primaries: its table of tags has at 4 an offset and a size."""
+    profile = bytearray(ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes())
+    red, green = (slice(profile.index(tag) + 4, profile.index(tag) + 12) for tag in (b"rXYZ", b"gXYZ"))
+    profile[red], profile[green] = profile[green], profile[red]
+    return bytes(profile)
+
+
+@pytest.mark.parametrize("name", ["a.png", "a.tif", "a.webp", "a.heic", "a.jpg"])
+def test_a_colour_profile_is_applied(name: str, tmp_path: Path) -> None:
+    image = Image.new("RGB", (64, 64), (200, 60, 30))
+    image.save(tmp_path / name, icc_profile=_with_red_and_green_exchanged(), quality=100)
+    read = read_image(tmp_path / name).image_srgb[32, 32]
+    np.testing.assert_allclose(read * 255, [60, 200, 30], atol=4)
+
+
+def test_a_colour_profile_leaves_alpha_grey_and_what_is_srgb(noise: np.ndarray, tmp_path: Path) -> None:
+    cut_out = Image.fromarray(np.dstack([noise, noise[..., 0]]))
+    cut_out.save(tmp_path / "a.png", icc_profile=_with_red_and_green_exchanged())
+    read = read_image(tmp_path / "a.png")
+    np.testing.assert_allclose(read.mask, noise[..., 0] / 255, atol=1e-6)
+    srgb = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
+    for name, profile in [("grey.png", srgb), ("colour.png", srgb), ("damaged.png", b"no profile")]:
+        image = Image.fromarray(noise).convert("L" if name == "grey.png" else "RGB")
+        image.save(tmp_path / name, icc_profile=profile)
+        expected = np.asarray(image.convert("RGB")) / 255
+        np.testing.assert_allclose(read_image(tmp_path / name).image_srgb, expected, atol=1e-6)
+
+
+def test_inks_of_sixteen_bits_are_read_as_colour(tmp_path: Path) -> None:
+    red = np.zeros((16, 16, 4), np.uint16)
+    red[..., 1:3] = 65535
+    tifffile.imwrite(tmp_path / "a.tif", red, photometric="separated")
+    read = read_image(tmp_path / "a.tif")
+    np.testing.assert_allclose(read.image_srgb[8, 8], [1, 0, 0], atol=0.01, err_msg="no cyan: red")
+    assert read.mask is None, "black ink is no alpha"
+
+
+def test_floating_point_numbers_are_from_black_to_white(noise: np.ndarray, tmp_path: Path) -> None:
+    """Some programs write 0 to 255; a few lights beyond white are lights."""
+    values = noise.astype(np.float32) / 255
+    values[0, 0] = 20
+    tifffile.imwrite(tmp_path / "a.tif", values, photometric="rgb")
+    np.testing.assert_allclose(read_image(tmp_path / "a.tif").image_srgb, np.minimum(values, 1), atol=1e-6)
+    tifffile.imwrite(tmp_path / "b.tif", noise.astype(np.float32), photometric="rgb")
+    with pytest.raises(ReconstructionError, match=r"Most of b.tif is brighter than white") as raised:
+        read_image(tmp_path / "b.tif")
+    assert raised.value.remedy
 
 
 def test_sixteen_bits_are_kept(noise: np.ndarray, tmp_path: Path) -> None:

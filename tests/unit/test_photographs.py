@@ -44,6 +44,13 @@ def test_pictures_that_cannot_be_read_are_named(tmp_path: Path) -> None:
     assert passed_over_text(()) == ""
 
 
+def test_raw_photographs_beside_their_copies_are_not_passed_over(tmp_path: Path) -> None:
+    """As of a camera that is set to save both."""
+    touched(tmp_path, "IMG_1.CR2", "IMG_1.JPG", "IMG_2.CR2", "masks/IMG_2.png")
+    assert passed_over([tmp_path, tmp_path / "masks"]) == ("IMG_2.CR2",)
+    assert passed_over([tmp_path / "IMG_1.CR2", tmp_path / "IMG_1.JPG"]) == ()
+
+
 def test_photographs_of_a_folder(tmp_path: Path) -> None:
     touched(tmp_path, "1.jpg", "2.HEIC", "3.WEBP", "4.bmp", ".5.jpg", "sub/6.jpg", "8.dng")
     (tmp_path / "7.png").mkdir()
@@ -51,7 +58,7 @@ def test_photographs_of_a_folder(tmp_path: Path) -> None:
 
 
 def test_masks_of_photographs_are_none(tmp_path: Path) -> None:
-    touched(tmp_path, "1.jpg", "1_mask.png", "2.HEIC", "2.JPG", "2.jpg_MASK.png", "3_mask.png")
+    touched(tmp_path, "1.jpg", "1_mask.png", "2.HEIC", "2.JPG", "2.jpg_MASK.png", "2.Mask.tif", "3_mask.png")
     assert sorted(path.name for path in photographs_in(tmp_path)) == ["1.jpg", "2.JPG", "3_mask.png"]
 
 

@@ -21,6 +21,7 @@ from backend.stages.photos import (
 )
 
 CONFIG = PhotosConfig(max_side_px=100)
+MASK_NAMES = ["a.png", "A.TIF", "a_mask.png", "a.jpg.png", "a.jpg_mask.png", "a.mask.png", "a.jpg.mask.png"]
 
 
 def write(path: Path, width: int = 40, height: int = 30, level: int = 128) -> Path:
@@ -92,7 +93,7 @@ def test_an_unreadable_photograph_is_named(tmp_path: Path) -> None:
     assert "broken.jpg" in error.text
 
 
-@pytest.mark.parametrize("mask_name", ["a.png", "A.TIF", "a_mask.png", "a.jpg.png", "a.jpg_mask.png"])
+@pytest.mark.parametrize("mask_name", MASK_NAMES)
 def test_masks_are_found_by_name(mask_name: str, tmp_path: Path) -> None:
     path = write(tmp_path / mask_name)
     write(tmp_path / "ab.png")
@@ -139,6 +140,69 @@ def test_a_mask_counts_before_alpha(tmp_path: Path) -> None:
     np.testing.assert_allclose(alpha.mask, 0.2, atol=1e-6)
 
 
+@pytest.mark.parametrize("alpha", [0, 128, 254, "one pixel", "a border", "the subject away"])
+def test_an_alpha_that_cuts_out_nothing_hides_no_mask_in_colours(alpha: int | str, tmp_path: Path) -> None:
+    photos = [write(tmp_path / name) for name in ["a.png", "b.png"]]
+    subject = np.zeros((30, 40), np.uint8)
+    subject[10:20, 10:30] = 255
+    channel = np.full_like(subject, alpha if isinstance(alpha, int) else 255)
+    if alpha == "the subject away":
+        channel -= subject
+    elif alpha == "a border":
+        channel[0] = 0
+    elif alpha == "one pixel":
+        channel[3, 3] = 0
+    (tmp_path / "m").mkdir()
+    Image.fromarray(np.dstack([subject, subject, subject, channel])).save(tmp_path / "m" / "a.png")
+    mask = load(photos, tmp_path / "m")[0].mask
+    assert mask is not None
+    np.testing.assert_array_equal(mask > 0.5, subject > 0)
+
+
+def test_alpha_alone_is_a_mask_also_of_what_fills_the_picture(tmp_path: Path) -> None:
+    photos = [write(tmp_path / name) for name in ["a.png", "b.png"]]
+    alpha = np.full((30, 40), 255, np.uint8)
+    alpha[10:20, 10:30] = 0
+    (tmp_path / "m").mkdir()
+    Image.fromarray(np.dstack([np.zeros_like(alpha), alpha])).save(tmp_path / "m" / "a.png")
+    mask = load(photos, tmp_path / "m")[0].mask
+    assert mask is not None
+    np.testing.assert_array_equal(mask > 0.5, alpha > 0)
+
+
+def test_a_photograph_that_is_transparent_all_over_is_told_as_such(tmp_path: Path) -> None:
+    for name in ["a.png", "b.png"]:
+        Image.new("LA", (40, 30), (100, 0)).save(tmp_path / name)
+    error = refusal([tmp_path])
+    assert "alpha channel of a.png is empty" in error.text
+    assert "opaque" in error.remedy
+
+
+def test_masks_of_a_kind_that_cannot_be_read_are_named(tmp_path: Path) -> None:
+    photos = [write(tmp_path / name) for name in ["a.png", "b.png"]]
+    write(tmp_path / "m" / "a_mask.gif")
+    assert "a_mask.gif. Convert" in refusal(photos, tmp_path / "m").remedy
+
+
+@pytest.mark.parametrize("as_files", [False, True])
+def test_raw_photographs_are_named_and_their_thumbnails_no_photographs(
+    as_files: bool, tmp_path: Path
+) -> None:
+    """As in `--images *.NEF`: a raw photograph is a TIFF whose first picture is a small one."""
+    for name in ["1.NEF", "2.dng"]:
+        write(tmp_path / f"{name}.tif").rename(tmp_path / name)
+    sources = sorted(tmp_path.iterdir()) if as_files else [tmp_path]
+    error = refusal(sources)
+    assert error.code == ErrorCode.NO_PHOTOS
+    assert "1.NEF, 2.dng. Convert" in error.remedy
+    sources.append(write(tmp_path / "3.jpg"))
+    error = refusal(sources)
+    assert error.code == ErrorCode.TOO_FEW_PHOTOS
+    assert "1.NEF, 2.dng. Convert" in error.remedy
+    sources.append(write(tmp_path / "4.jfif.jpg").rename(tmp_path / "4.jfif"))
+    assert [photo.name for photo in load(sources)] == ["3.jpg", "4.jfif"]
+
+
 def test_masks_that_cut_nothing_out_are_told(tmp_path: Path) -> None:
     for name in ["a.png", "b.png"]:
         write(tmp_path / name)
@@ -147,6 +211,21 @@ def test_masks_that_cut_nothing_out_are_told(tmp_path: Path) -> None:
     assert white_masks_text(load([tmp_path])) == ""
     Image.fromarray(255 * np.eye(30, 40, dtype=np.uint8)).save(tmp_path / "white" / "a.png")
     assert white_masks_text(load([tmp_path], tmp_path / "white")) == ""
+
+
+def test_inverted_masks_are_told(tmp_path: Path) -> None:
+    subject = np.zeros((30, 40), np.uint8)
+    subject[10:20, 10:30] = 255
+    facade = np.full_like(subject, 255)
+    facade[:4] = 0
+    (tmp_path / "m").mkdir()
+    for name in ["a.png", "b.png"]:
+        write(tmp_path / name)
+        Image.fromarray(255 - subject).save(tmp_path / "m" / name)
+    assert "of the background" in white_masks_text(load([tmp_path], tmp_path / "m"))
+    for right in (subject, facade):
+        Image.fromarray(right).save(tmp_path / "m" / "b.png")
+        assert white_masks_text(load([tmp_path], tmp_path / "m")) == ""
 
 
 def test_unusable_masks_are_refused(tmp_path: Path) -> None:
@@ -188,14 +267,14 @@ def test_masks_beside_the_photographs_are_masks_and_no_photographs(tmp_path: Pat
     """Photographs are given as their folder, or as everything in it."""
     for name in ["a.jpg", "b.JPG", "c.png"]:
         write(tmp_path / name)
-    for name in ["a_mask.png", "B_mask.png", "c.png_mask.png", "another_mask.png"]:
+    for name in ["a_mask.png", "B.mask.png", "c.png.mask.png", "another_mask.png"]:
         write(tmp_path / name, level=255)
     for sources in ([tmp_path], sorted(tmp_path.iterdir())):
         photos = load(sources, tmp_path)
         assert [photo.name for photo in photos] == ["a.jpg", "another_mask.png", "b.JPG", "c.png"]
         masked = [photo.name for photo in photos if photo.mask is not None and photo.mask.min() == 1]
         assert masked == ["a.jpg", "b.JPG", "c.png"]
-        assert "a_mask.png, B_mask.png, c.png_mask.png" in unused_masks_text(sources)
+        assert "a_mask.png, B.mask.png, c.png.mask.png" in unused_masks_text(sources)
     assert unused_masks_text([tmp_path / "a.jpg", tmp_path / "b.JPG"]) == ""
 
 
@@ -256,7 +335,7 @@ def test_masks_are_turned_with_their_photographs(orientation: int, mask_knows: b
     assert photo.exif_orientation == orientation
     if mask_knows or orientation == 1 or orientation >= 5:
         np.testing.assert_array_equal(photo.mask, photo.image_srgb[..., 0])
-    assert ("a.png" in turned_text([photo])) == (orientation in (2, 3, 4))
+    assert ("a.png" in turned_text("masks", [photo])) == (orientation in (2, 3, 4))
 
 
 def test_an_upright_mask_stays_so(tmp_path: Path) -> None:

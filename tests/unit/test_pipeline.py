@@ -2,6 +2,7 @@
 
 import inspect
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,8 +16,10 @@ from backend.errors import Cancelled, ErrorCode, ReconstructionError
 from backend.pipeline import Job, Listener, Stages
 from backend.presets import PRESETS
 from backend.records import load_record
-from backend.scene import Photo
+from backend.scene import Decision, Photo, Region, SolvedCameras
+from backend.stages.which_way_up import WHICH_WAY_UP
 from backend.workspace import StageCost, open_workspace
+from tests.synthetic_scene import arc_cameras, photographed
 
 SETTINGS = PRESETS["fast"]
 
@@ -192,11 +195,10 @@ def test_masks_among_the_photographs_that_nobody_asked_for_are_told(photos: Path
     assert [photo.name for photo in found if photo.mask is not None] == ["1.png"]
 
 
-@pytest.mark.parametrize(
-    ("given", "told"), [({}, False), ({"masks": "masks"}, True), ({"cameras": "transforms.json"}, True)]
-)
+@pytest.mark.parametrize("masked", [False, True])
+@pytest.mark.parametrize("cameras", ["none", "in doubt", "known"])
 def test_what_may_not_be_turned_with_its_photograph_is_told(
-    given: dict[str, str], told: bool, photos: Path, tmp_path: Path
+    masked: bool, cameras: str, photos: Path, tmp_path: Path
 ) -> None:
     """Upside down or not: the shape of a mask or camera does not tell."""
     exif = Image.Exif()
@@ -204,10 +206,29 @@ def test_what_may_not_be_turned_with_its_photograph_is_told(
     Image.new("RGB", (6, 4)).save(photos / "1.png", exif=exif)
     masks = make_photos(tmp_path / "masks", 5)
     Image.fromarray(np.eye(4, 6, dtype=np.uint8)).save(masks / "0.png")  # not white all over
-    (tmp_path / "transforms.json").write_text('{"frames": []}')
-    _, warned = found_and_warned(job_of(photos, **{name: tmp_path / path for name, path in given.items()}))
-    assert [text for text in warned if "EXIF asks to turn 1.png:" in text] == warned
-    assert bool(warned) == told
+    path = tmp_path / "transforms.json"
+    path.write_text('{"frames": []}')
+    known = Decision(what=WHICH_WAY_UP, choice="of upright photographs", because="so it fits")
+    solved = photographed(arc_cameras(2, 20, 16)).solved()
+    solved = replace(solved, decisions=(known,) if cameras == "known" else ())
+
+    def solve_cameras(*_: Any, **__: Any) -> SolvedCameras:
+        return solved
+
+    def find_region(*_: Any, **__: Any) -> Region:
+        raise Cancelled
+
+    job = job_of(photos, masks=masks if masked else None, cameras=None if cameras == "none" else path)
+    warned: list[str] = []
+    listener = Quiet()
+    listener.warned = warned.append  # type: ignore[method-assign]
+    stages = Stages(solve_cameras=solve_cameras, find_region=find_region)
+    with open_workspace(job.output) as opened, pytest.raises(Cancelled):
+        pipeline.run(job, opened, settings=SETTINGS, stages=stages, listener=listener)
+    expected = ["masks"] * masked + ["cameras"] * (cameras == "in doubt")
+    assert [text.partition(" are taken")[0] for text in warned] == [
+        f"EXIF asks to turn 1.png: their {what}" for what in expected
+    ]
 
 
 def test_a_finished_job_is_not_replaced_by_another_shoot(photos: Path, tmp_path: Path) -> None:

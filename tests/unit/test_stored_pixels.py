@@ -17,7 +17,9 @@ from backend.stages.lenses import Placement, undistorted_view
 from backend.stages.nerfstudio import transforms_json
 from backend.stages.photos import PhotosConfig, load_photos
 from backend.stages.stored_pixels import turned_clockwise
+from backend.stages.which_way_up import WHICH_WAY_UP, read_placement_that_fits
 from tests.lens_models import LENSES
+from tests.synthetic_scene import Scene, arc_cameras, photographed, write_scene
 
 WIDTH, HEIGHT = 160, 120
 RED_DOT_WORLD = np.array([[-0.3, -0.7, 3.0]])
@@ -31,6 +33,7 @@ def photographs(folder: Path, orientation: int, width: int = WIDTH) -> tuple[Pho
     exif[ExifTags.Base.Orientation] = orientation
     for name in ("a.png", "b.png"):
         Image.fromarray(pixels).save(folder / name, exif=exif)
+        pixels[0, 0] = 255  # no copy of the first
     return load_photos([folder / "a.png", folder / "b.png"], None, PhotosConfig(), progress=no_progress)
 
 
@@ -92,6 +95,44 @@ def test_else_they_are_those_of_upright_photographs(
     assert (placement.placed[0].lens.width, placement.placed[0].lens.height) == shape
     assert placement.decisions == ()
     assert may_be_unturned(given)
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    return photographed(arc_cameras(4, 60, 320), wall=True).without_masks()
+
+
+@pytest.mark.parametrize("upside_down", [(0, 1, 2, 3), (1,)])
+@pytest.mark.parametrize("stored", [True, False])
+def test_of_photographs_upside_down_the_cameras_that_fit_are_taken(
+    upside_down: tuple[int, ...], stored: bool, scene: Scene, tmp_path: Path
+) -> None:
+    """An arc seen upside down is nearly that of a hollow: pairs alone hardly tell."""
+    write_scene(scene, tmp_path)
+    exif = Image.Exif()
+    exif[ExifTags.Base.Orientation] = 3
+    for index in upside_down:
+        path = tmp_path / "images" / scene.views[index].name
+        pixels = np.asarray(Image.open(path).convert("RGB"))
+        Image.fromarray(pixels if stored else pixels[::-1, ::-1]).save(path, exif=exif)
+    photos = load_photos([tmp_path / "images"], None, PhotosConfig(), progress=no_progress)
+    given = tmp_path / "images" / "transforms.json"
+    solved = solve_cameras(photos, given, CamerasConfig(), workdir=tmp_path, seed=0, progress=no_progress)
+    (told,) = [decision.choice for decision in solved.decisions if decision.what == WHICH_WAY_UP]
+    assert told == ("of pixels as they are stored" if stored else "of upright photographs")
+    half_turn = np.diag([-1.0, -1.0, 1.0, 1.0])
+    for index, (view, true) in enumerate(zip(solved.views, scene.views, strict=True)):
+        pose = true.camera.camera_from_world
+        expected = half_turn @ pose if stored and index in upside_down else pose
+        np.testing.assert_allclose(view.camera.camera_from_world, expected, atol=1e-9)
+
+
+def test_nothing_is_decided_where_photographs_share_too_little(tmp_path: Path) -> None:
+    photos = photographs(tmp_path, 3)
+    nothing = np.zeros((0, 2), bool)
+    placement = read_placement_that_fits(photos, transforms(tmp_path), lambda _: nothing)
+    np.testing.assert_array_equal(placement.placed[0].camera_from_world, np.eye(4))
+    assert placement.decisions == ()
 
 
 def test_our_own_file_and_a_model_say_how_they_are_turned(tmp_path: Path) -> None:
