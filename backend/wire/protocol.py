@@ -12,6 +12,7 @@ import types
 import typing
 from collections.abc import Callable
 from dataclasses import MISSING, asdict, dataclass, fields
+from reprlib import repr as shown
 
 T = typing.TypeVar("T")
 
@@ -173,7 +174,7 @@ def decode(line: str) -> Message:
     found = _json_object(line)
     name = found.pop("type", None)
     if not isinstance(name, str) or name not in MESSAGES:
-        raise ProtocolError(f"unknown message type {name!r}; known: {', '.join(MESSAGES)}")
+        raise ProtocolError(f"unknown message type {shown(name)}; known: {', '.join(MESSAGES)}")
     kind = MESSAGES[name]
     if kind is Hello:
         check_version(found.get("protocol"))  # first: another version may have other fields
@@ -193,9 +194,9 @@ def decode_job(text: str) -> Job:
     choices = (("preset", job.preset, PRESETS), ("device", job.device, DEVICES), ("until", job.until, UNTIL))
     for name, value, known in choices:
         if value not in known:
-            raise ProtocolError(f"job: {name} is {value!r}; known: {', '.join(known)}")
+            raise ProtocolError(f"job: {name} is {shown(value)}; known: {', '.join(known)}")
     if not 0 <= job.seed <= LARGEST_SEED:
-        raise ProtocolError(f"job: seed is {job.seed}; it must be from 0 to {LARGEST_SEED}")
+        raise ProtocolError(f"job: seed is {shown(job.seed)}; it must be from 0 to {LARGEST_SEED}")
     if job.budget_s is not None and job.budget_s <= 0:
         raise ProtocolError(f"job: budget_s is {job.budget_s}; it must be positive")
     _check_region(job)
@@ -231,7 +232,7 @@ def _check_region(job: Job) -> None:
 def check_version(found: object) -> None:
     """ProtocolError when the other side speaks another version of the protocol."""
     if found != PROTOCOL_VERSION or isinstance(found, bool):
-        raise ProtocolError(f"the other side speaks protocol {found!r}, this one {PROTOCOL_VERSION}")
+        raise ProtocolError(f"the other side speaks protocol {shown(found)}, this one {PROTOCOL_VERSION}")
 
 
 def _json_object(text: str) -> dict[str, object]:
@@ -263,7 +264,7 @@ def _record(kind: Callable[..., T], found: dict[str, object], name: str) -> T:
     missing = [field for field in missing if field not in found]
     unknown = [field for field in found if field not in hints]
     if missing or unknown:
-        raise ProtocolError(f"{name}: missing {missing}, unknown {unknown}; known: {list(hints)}")
+        raise ProtocolError(f"{name}: missing {missing}, unknown {shown(unknown)}; known: {list(hints)}")
     return kind(**{field: _value(hints[field], value, f"{name}.{field}") for field, value in found.items()})
 
 
@@ -274,7 +275,7 @@ def _value(hint: object, value: object, where: str) -> object:
         return None if value is None else _value(hint, value, where)
     if typing.get_origin(hint) is tuple:
         if not isinstance(value, list):
-            raise ProtocolError(f"{where} is {value!r}, expected a list")
+            raise ProtocolError(f"{where} is {shown(value)}, expected a list")
         item_hint = typing.get_args(hint)[0]
         return tuple(_value(item_hint, item, where) for item in value)
     if hint is float and type(value) is int:
@@ -283,5 +284,5 @@ def _value(hint: object, value: object, where: str) -> object:
         except OverflowError as error:
             raise ProtocolError(f"{where} is larger than any float") from error
     if type(value) is not hint:  # exact: a bool is no int
-        raise ProtocolError(f"{where} is {value!r}, expected {getattr(hint, '__name__', hint)}")
+        raise ProtocolError(f"{where} is {shown(value)}, expected {getattr(hint, '__name__', hint)}")
     return value
