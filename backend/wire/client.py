@@ -189,7 +189,7 @@ class WireProcess:
                         self._put(ProtocolError(str(error)))
 
     def _put(self, item: Message | ProtocolError) -> None:
-        """Onto the queue, once the caller has taken enough from it: until then the pipe fills, not the memory."""
+        """Onto the queue when the caller has taken enough: until then the pipe fills, not the memory."""
         while self._messages.qsize() >= _MOST_WAITING and not self._ended:
             time.sleep(_WAIT_S)
         if not self._ended:

@@ -68,10 +68,10 @@ def test_an_interrupt_that_cannot_be_sent_is_no_error(
 SAYS = """
 import os, subprocess, sys, time
 def say(text): sys.stdout.write(text + "\\n")
-def hello(): say('{"type": "hello", "protocol": 1, "backend": "0", "python": "3", "pid": 1}'); sys.stdout.flush()
 PROGRESS = '{"type": "progress", "stage": "s", "fraction": 0.5, "text": "", "remaining_s": null}'
 WARNED, FINISHED = '{"type": "warned", "text": "dark"}', '{"type": "finished", "output": "", "files": []}'
-hello()
+say('{"type": "hello", "protocol": 1, "backend": "0", "python": "3", "pid": 1}')
+sys.stdout.flush()
 """
 
 
@@ -110,8 +110,13 @@ def test_a_child_that_keeps_stdout_does_not_hide_its_parents_death(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.setattr(client, "PARTED_S", 0.3)
-    body = 'c = subprocess.Popen(["sleep", "60"], start_new_session=True); say(WARNED.replace("dark", str(c.pid)))'
-    _, child, last = heard_of(says(body + "; sys.stdout.flush(); os._exit(3)", tmp_path))
+    body = """
+child = subprocess.Popen(["sleep", "60"], start_new_session=True)
+say(WARNED.replace("dark", str(child.pid)))
+sys.stdout.flush()
+os._exit(3)
+"""
+    _, child, last = heard_of(says(body, tmp_path))
     os.kill(int(child.text), signal.SIGKILL)  # type: ignore[union-attr]
     assert isinstance(last, Failed)
     assert "exit code 3" in last.text
