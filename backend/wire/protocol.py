@@ -7,6 +7,7 @@ sides import this one file, so neither can misspell the other.
 """
 
 import json
+import math
 import os
 import types
 import typing
@@ -182,8 +183,11 @@ def decode(line: str) -> Message:
 
 
 def encode_job(job: Job) -> str:
-    """The content of job.json."""
-    return json.dumps(asdict(job), indent=2, allow_nan=False, ensure_ascii=True) + "\n"
+    """The content of job.json; ProtocolError on a number that is not finite."""
+    try:
+        return json.dumps(asdict(job), indent=2, allow_nan=False, ensure_ascii=True) + "\n"
+    except ValueError as error:
+        raise ProtocolError("job: a number is not finite") from error
 
 
 def decode_job(text: str) -> Job:
@@ -205,8 +209,11 @@ def decode_job(text: str) -> Job:
 
 def check_paths(job: Job) -> None:
     """ProtocolError for one that no file can have: who only looks at a job need not mind."""
-    for path in filter(None, (*job.images, job.output, job.cameras, job.masks, job.truth)):
-        if not is_path(path):
+    named = {name: getattr(job, name) for name in ("output", "cameras", "masks", "truth")}
+    for name, path in (*(("images", image) for image in job.images), *named.items()):
+        if path is not None and not path:
+            raise ProtocolError(f"job: {name} is empty")
+        if path is not None and not is_path(path):
             raise ProtocolError(f"job: {path!r} has a letter that the path of a file cannot have")
 
 
@@ -278,11 +285,18 @@ def _value(hint: object, value: object, where: str) -> object:
             raise ProtocolError(f"{where} is {shown(value)}, expected a list")
         item_hint = typing.get_args(hint)[0]
         return tuple(_value(item_hint, item, where) for item in value)
-    if hint is float and type(value) is int:
-        try:
-            return float(value)  # JSON writers may drop the ".0"
-        except OverflowError as error:
-            raise ProtocolError(f"{where} is larger than any float") from error
+    if hint is float and type(value) in (int, float):
+        return _finite(value, where)
     if type(value) is not hint:  # exact: a bool is no int
         raise ProtocolError(f"{where} is {shown(value)}, expected {getattr(hint, '__name__', hint)}")
     return value
+
+
+def _finite(value: typing.Any, where: str) -> float:
+    """The number, for which JSON writers may drop the ".0"; 1e999 is read as infinity."""
+    try:
+        if math.isfinite(value):
+            return float(value)
+    except OverflowError:  # an int
+        pass
+    raise ProtocolError(f"{where} is larger than any float")

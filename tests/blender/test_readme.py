@@ -132,6 +132,27 @@ def test_no_images_and_missing_ones_are_said(parts: Callable[[str], ModuleType],
 
 
 @pytest.mark.parametrize(
+    ("wrong", "said"),
+    [
+        ({"region": ((0.0, 0.0, float("nan")), 1.0)}, "not finite"),
+        ({"region": (0.0, 0.0, 0.0, 1.0)}, "a centre of three numbers and a radius"),
+        ({"region": ((0.0, 0.0), 1.0)}, "region_centre"),
+        ({"preset": "best"}, "best"),
+        ({"preset": None}, "preset"),
+        ({"seed": 2**40}, "seed"),
+        ({"seed": 1.5}, "seed"),
+        ({"seed": True}, "seed"),
+    ],
+)
+def test_arguments_that_make_no_sense_are_told_before_a_folder_is_made(
+    rehearsed: object, parts: Callable[[str], ModuleType], wrong: dict[str, Any], said: str
+) -> None:
+    with pytest.raises(ValueError, match=said):
+        parts("api").reconstruct(["photos"], output="jobs", **wrong)
+    assert not Path("jobs").exists()
+
+
+@pytest.mark.parametrize(
     ("words", "said"),
     [
         ("reconstruct nowhere --output jobs", "nowhere"),
@@ -141,6 +162,12 @@ def test_no_images_and_missing_ones_are_said(parts: Callable[[str], ModuleType],
         ("reconstruct photos --output jobs --preset best", "best"),
         ("render --object Nobody --output jobs", "Nobody"),
         ("render --object Suzanne --output photos/a.png", "a.png"),
+        ("render --object Suzanne --output jobs --views 1", "--views: must be from 2 to"),
+        ("render --object Suzanne --output jobs --views 100000", "--views: must be from 2 to"),
+        ("render --object Suzanne --output jobs --width 9000", "--width: must be from 32 to 8192"),
+        ("render --object Suzanne --output jobs --height x", "--height"),
+        ("render --object Suzanne --output jobs --samples 0", "--samples"),
+        ("render --object Suzanne --output jobs --seed -1", "--seed"),
         ("explode", "explode"),
         ("", "required"),
     ],
