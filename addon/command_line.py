@@ -109,22 +109,29 @@ def _parser() -> argparse.ArgumentParser:
     add("--cameras", type=Path, help="transforms.json or COLMAP model; else they are estimated")
     add("--masks", type=Path, help="folder with an image per photograph, white on the subject")
     add("--truth", type=Path, help="mesh file to measure the result against")
-    add("--preset", choices=PRESETS, default="balanced")
-    add("--device", choices=DEVICES, default="auto")
-    add("--seed", type=int, default=0)
+    add("--preset", choices=PRESETS, default="balanced", help="speed against detail (balanced)")
+    add("--device", choices=DEVICES, default="auto", help="where to compute (auto)")
+    add("--seed", type=int, default=0, help="random seed (0)")
     add("--save", type=Path, metavar="FILE.blend", help="save the scene with the mesh; replaces that file")
     rendering = commands.add_parser("render", help="render sparse views of an object of the .blend")
+    rendering.epilog = "What is left out is as in the scene's settings."
     rendering.set_defaults(run=_render)
     add = rendering.add_argument
     add("--object", required=True, help="name of the object")
     add("--output", type=Path, required=True, help="folder in which the views get their own")
-    add("--views", type=_limited("view_count"), dest="view_count")
-    add("--layout", type=str.upper, dest="arrangement", choices=("ARC", "RING", "HEMISPHERE"))
-    add("--seed", type=_limited("view_seed"), dest="view_seed")
-    add("--width", type=_limited("resolution_x"), dest="resolution_x")
-    add("--height", type=_limited("resolution_y"), dest="resolution_y")
-    add("--samples", type=_limited("samples"))
-    add("--engine", type=str.upper, choices=("CYCLES", "WORKBENCH", "SCENE"))
+    add("--views", type=_limited("view_count"), dest="view_count", help="number of pictures")
+    add(
+        "--layout",
+        type=str.upper,
+        dest="arrangement",
+        choices=("ARC", "RING", "HEMISPHERE"),
+        help="of the cameras",
+    )
+    add("--seed", type=_limited("view_seed"), dest="view_seed", help="of their irregularity")
+    add("--width", type=_limited("resolution_x"), dest="resolution_x", help="of the pictures, in pixels")
+    add("--height", type=_limited("resolution_y"), dest="resolution_y", help="of the pictures, in pixels")
+    add("--samples", type=_limited("samples"), help="light paths per pixel in Cycles")
+    add("--engine", type=str.upper, choices=("CYCLES", "WORKBENCH", "SCENE"), help="what renders")
     commands.add_parser("check", help="check that FewView is set up").set_defaults(run=_check)
     return parser
 
