@@ -4,6 +4,7 @@ import re
 
 import pytest
 
+from backend.report_page.diagrams import _BARS_WIDTH, _GRAPH_WIDTH, _MAP_WIDTH
 from backend.report_page.template import TEMPLATES
 
 CSS = (TEMPLATES / "page.css").read_text(encoding="utf-8")
@@ -79,3 +80,14 @@ def test_names_from_right_to_left_leave_what_is_beside_them_alone(page: str) -> 
 def test_headers_of_tables_have_words(page: str) -> None:
     text = (TEMPLATES / page).read_text(encoding="utf-8")
     assert not re.search(r"<th[^>]*></th>", text)
+
+
+def test_words_of_diagrams_can_be_read_on_a_phone() -> None:
+    """At least 11 pixels high where diagrams are drawn smaller; what does not fit is scrolled within."""
+    phone = CSS[CSS.index("@media (max-width: 640px)") : CSS.index("@media (scripting")]
+    drawn_px, narrowest_px = (
+        int(re.search(pattern, phone)[1])  # type: ignore[index]
+        for pattern in (r"svg text \{ font-size: (\d+)px", r"\.diagram svg \{ min-width: (\d+)px")
+    )
+    assert drawn_px * narrowest_px / max(_GRAPH_WIDTH, _MAP_WIDTH, _BARS_WIDTH) >= 11
+    assert ".diagram { overflow-x: auto; }" in phone
