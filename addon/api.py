@@ -62,6 +62,7 @@ def reconstruct(
     reason = reason_against_changes(bpy.context.scene) or reason
     if python is None or reason:
         raise jobs.JobError(reason)
+    centre, radius = _region(region)
     asked = Job(
         protocol=PROTOCOL_VERSION,
         images=tuple(str(Path(path).absolute()) for path in images),
@@ -72,8 +73,8 @@ def reconstruct(
         preset=preset,
         device=device,
         seed=seed,
-        region_centre=None if region is None else tuple(map(float, region[0])),
-        region_radius=None if region is None else float(region[1]),
+        region_centre=centre,
+        region_radius=radius,
         keep_stages=False,
     )
     _check(asked)
@@ -94,6 +95,19 @@ def _check(asked: Job) -> None:
     missing = [path for path in named if not Path(path).exists()]
     if missing:
         raise ValueError(f"There is nothing at {', '.join(missing)}: check the path")
+
+
+def _region(
+    given: tuple[tuple[float, float, float], float] | None,
+) -> tuple[tuple[float, ...] | None, float | None]:
+    """Centre and radius. Raises ValueError where it is something else."""
+    if given is None:
+        return None, None
+    try:
+        centre, radius = given
+        return tuple(map(float, centre)), float(radius)
+    except (TypeError, ValueError) as error:
+        raise ValueError("The region is a centre of three numbers and a radius: ((x, y, z), r)") from error
 
 
 def _absolute(path: Path | str | None) -> str | None:

@@ -18,6 +18,7 @@ from ..backend.wire.protocol import CANCELLED, CRASHED, DEVICES, PRESETS, PROTOC
 from . import jobs
 from .api import ReconstructionFailed, reconstruct
 from .job_folder import RESULT
+from .properties import FEWVIEW_PG_settings
 
 NAME = "fewview"
 EXIT_FINE, EXIT_FAULT, EXIT_USER_ERROR, EXIT_CANCELLED = 0, 1, 2, 130
@@ -108,24 +109,44 @@ def _parser() -> argparse.ArgumentParser:
     add("--cameras", type=Path, help="transforms.json or COLMAP model; else they are estimated")
     add("--masks", type=Path, help="folder with an image per photograph, white on the subject")
     add("--truth", type=Path, help="mesh file to measure the result against")
-    add("--preset", choices=PRESETS, default="balanced")
-    add("--device", choices=DEVICES, default="auto")
-    add("--seed", type=int, default=0)
+    add("--preset", choices=PRESETS, default="balanced", help="speed against detail (balanced)")
+    add("--device", choices=DEVICES, default="auto", help="where to compute (auto)")
+    add("--seed", type=int, default=0, help="random seed (0)")
     add("--save", type=Path, metavar="FILE.blend", help="save the scene with the mesh; replaces that file")
     rendering = commands.add_parser("render", help="render sparse views of an object of the .blend")
+    rendering.epilog = "What is left out is as in the scene's settings."
     rendering.set_defaults(run=_render)
     add = rendering.add_argument
     add("--object", required=True, help="name of the object")
     add("--output", type=Path, required=True, help="folder in which the views get their own")
-    add("--views", type=int, dest="view_count")
-    add("--layout", type=str.upper, dest="arrangement", choices=("ARC", "RING", "HEMISPHERE"))
-    add("--seed", type=int, dest="view_seed")
-    add("--width", type=int, dest="resolution_x")
-    add("--height", type=int, dest="resolution_y")
-    add("--samples", type=int)
-    add("--engine", type=str.upper, choices=("CYCLES", "WORKBENCH", "SCENE"))
+    add("--views", type=_limited("view_count"), dest="view_count", help="number of pictures")
+    add(
+        "--layout",
+        type=str.upper,
+        dest="arrangement",
+        choices=("ARC", "RING", "HEMISPHERE"),
+        help="of the cameras",
+    )
+    add("--seed", type=_limited("view_seed"), dest="view_seed", help="of their irregularity")
+    add("--width", type=_limited("resolution_x"), dest="resolution_x", help="of the pictures, in pixels")
+    add("--height", type=_limited("resolution_y"), dest="resolution_y", help="of the pictures, in pixels")
+    add("--samples", type=_limited("samples"), help="light paths per pixel in Cycles")
+    add("--engine", type=str.upper, choices=("CYCLES", "WORKBENCH", "SCENE"), help="what renders")
     commands.add_parser("check", help="check that FewView is set up").set_defaults(run=_check)
     return parser
+
+
+def _limited(setting: str) -> Callable[[str], int]:
+    """The type of an argument with the limits of the setting, to which Blender cuts without a word."""
+    limits = FEWVIEW_PG_settings.bl_rna.properties[setting]
+
+    def number(text: str) -> int:
+        found = int(text)
+        if not limits.hard_min <= found <= limits.hard_max:
+            raise argparse.ArgumentTypeError(f"must be from {limits.hard_min} to {limits.hard_max}")
+        return found
+
+    return number
 
 
 def _exit_code(code: str) -> int:

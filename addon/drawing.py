@@ -8,6 +8,8 @@ from .state_lines import StepState
 
 _MAIN_SCALE = 1.5
 _PIXELS_PER_LETTER = 7.0
+_MOST_LETTERS = 1000
+"""Of what a program says: the sidebar is drawn many times a second, and its buttons are below."""
 
 
 def draw_button(
@@ -33,5 +35,10 @@ def draw_text(
     letters = max(int(width / (_PIXELS_PER_LETTER * scale)) - (8 if icon != "NONE" else 5), 16)
     column = layout.column(align=True)
     column.scale_y = 0.8
-    for number, line in enumerate(textwrap.wrap(text, letters)):
+    for number, line in enumerate(textwrap.wrap(brief(text), letters)):
         column.label(text=line, icon=icon if number == 0 else ("BLANK1" if icon != "NONE" else "NONE"))
+
+
+def brief(text: str) -> str:
+    """The text, or its beginning where it is without end."""
+    return text if len(text) <= _MOST_LETTERS else f"{text[:_MOST_LETTERS]}..."

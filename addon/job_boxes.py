@@ -3,7 +3,7 @@
 import bpy
 
 from . import jobs
-from .drawing import draw_button, draw_text
+from .drawing import brief, draw_button, draw_text
 from .environment import State
 from .operators.environment import backend_state
 from .progress import seconds_left, stage_words, time_words
@@ -40,10 +40,10 @@ def draw_running(layout: bpy.types.UILayout, context: bpy.types.Context, job: jo
     """Stage, bar, time left, and how to stop it."""
     left = seconds_left(job.share, job.elapsed_s)
     layout.label(text=job.title, icon="TIME")
-    words = stage_words(job.stage) if job.stage else "Starting"
+    words = brief(stage_words(job.stage)) if job.stage else "Starting"
     layout.progress(factor=job.share, text=f"{words}  {job.share:.0%}", type="BAR")
     row = layout.row()
-    row.label(text=job.text)
+    row.label(text=brief(job.text))
     if job.cancelling:
         layout.label(text="Stopping...")
     elif left is not None:

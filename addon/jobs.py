@@ -38,7 +38,7 @@ TICK_S = 0.1
 """Time between two looks at a running job."""
 _BUDGET_S = 0.008
 """Of one look; what is left waits for the next. Single steps of an import may take longer."""
-_MESSAGES_PER_TICK = 100
+_MESSAGES_PER_TICK = 1000
 _REFUSED = "result_refused"
 """Code of a failure on this side: what came back could not be used."""
 _EXPECTED = (FolderError, ValueError, OSError, RuntimeError, MemoryError)

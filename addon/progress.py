@@ -38,6 +38,8 @@ STAGE_WORDS = {
     "points": "Reading points",
     "surface": "Fitting the surface",
 }
+_MOST_STAGES = 100
+"""More are not believed."""
 _LEAST_SHARE = 0.04
 """Before that, nothing can be said of the time left."""
 
@@ -51,6 +53,7 @@ def total_share(stages_before: list[str], stage: str, num_left: int, fraction: f
     """Share of the whole job, 0 to 1, in a stage after others and before `num_left` of unknown names."""
     done = sum(_seconds(name) for name in stages_before)
     this = _seconds(stage)
+    num_left = min(max(num_left, 0), _MOST_STAGES)
     following = next((run[run.index(stage) + 1 :] for run in _RUNS if stage in run), ())
     left = sum(_seconds(name) for name in following[:num_left]) + max(num_left - len(following), 0)
     return min(max((done + fraction * this) / (done + this + left), 0.0), 1.0)

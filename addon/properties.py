@@ -72,7 +72,9 @@ class FEWVIEW_PG_settings(bpy.types.PropertyGroup):
             ("HEMISPHERE", "Hemisphere", "All around and from above"),
         ],
     )
-    view_count: IntProperty(name="Views", description="Number of cameras", default=6, min=2, soft_max=20)
+    view_count: IntProperty(
+        name="Views", description="Number of cameras", default=6, min=2, max=1000, soft_max=20
+    )
     arc: FloatProperty(
         name="Arc",
         description="Angle between the first camera and the last",

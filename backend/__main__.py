@@ -155,7 +155,7 @@ def _parser() -> argparse.ArgumentParser:
     rehearsal.add_argument(
         "--seconds", metavar="S", type=finite_number, default=1.0, help="how long it takes (1)"
     )
-    rehearsal.add_argument("--end", choices=ENDS, default="finished")
+    rehearsal.add_argument("--end", choices=ENDS, default="finished", help="how it ends (finished)")
     add_benchmark(commands.add_parser("benchmark", help="measure speed against error"))
     return parser
 

@@ -37,7 +37,14 @@ def add_benchmark(parser: argparse.ArgumentParser) -> None:
     add("--scenes", metavar="DIR", type=Path, help="the suite's scenes, as make renders them")
     add("--photos", metavar="DIR", type=Path, help="the sets of real photographs")
     add("--cases", nargs="+", metavar="CASE", help="of the suite, only these")
-    add("--presets", nargs="+", choices=PRESETS, default=["fast", "balanced"])
+    add(
+        "--presets",
+        nargs="+",
+        choices=PRESETS,
+        metavar="PRESET",
+        default=["fast", "balanced"],
+        help=f"of {', '.join(PRESETS)} (fast balanced)",
+    )
     add("--seeds", type=count, metavar="N", default=3, help="how often to run everything (3)")
     add(
         "--budgets",

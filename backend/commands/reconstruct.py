@@ -225,8 +225,9 @@ def _work_and_say(
 def _checked(job: protocol.Job) -> protocol.Job:
     """The job, if it could have come over the wire; ReconstructionError(SETTINGS_INVALID) otherwise."""
     try:
+        protocol.check_paths(job)
         return protocol.decode_job(protocol.encode_job(job))
-    except ValueError as error:  # ProtocolError, or a number that is not finite
+    except protocol.ProtocolError as error:
         text = f"The job cannot be used: {error}."
         raise ReconstructionError(ErrorCode.SETTINGS_INVALID, text, "Check the options.") from error
 

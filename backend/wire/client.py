@@ -2,7 +2,8 @@
 
 Whatever happens, exactly one `Finished` or `Failed` comes out, as the last message: a program that ends
 without a last word gets a `Failed` made up from its exit code and the end of its log. Nothing here waits,
-so that a user interface can call it from a timer. Standard library only.
+so that a user interface can call it from a timer, and what is kept of the program's words has bounds.
+Standard library only.
 """
 
 import os
@@ -23,8 +24,10 @@ from .protocol import (
     Cancel,
     Failed,
     Finished,
+    Heartbeat,
     Hello,
     Message,
+    Progress,
     ProtocolError,
     decode,
     encode,
@@ -34,7 +37,15 @@ ROOT = Path(__file__).resolve().parents[2]
 """Folder that holds the package `backend`."""
 INTERRUPT_AFTER_S, TERMINATE_AFTER_S, KILL_AFTER_S = 10.0, 15.0, 20.0
 """The ladder after a cancel line that is not obeyed."""
+PARTED_S = 5.0
+"""For how long a program may outlive its stdout, or a child of it hold that open after its death."""
+_LONGEST_LINE_BYTES, _MOST_BYTES = 2**20, 2**22
+"""Of one message, and of all but progress and signs of life: a caller keeps those."""
+_MOST_WAITING = 1000
+"""Messages that the caller has not taken yet; then the program has to wait."""
+_WAIT_S = 0.02
 _LOG_TAIL_BYTES = 2000
+_PLEASE_REPORT = "Check the installation (doctor); where it is ready, please report this with the log."
 
 _WINDOWS_CODES = {
     0xC0000005: "a memory access violation",
@@ -69,8 +80,9 @@ class WireProcess:
         """
         self._log_path = log_path
         self._noisy_start = noisy_start
-        self._messages: queue.SimpleQueue[Message | ProtocolError | None] = queue.SimpleQueue()
+        self._messages: queue.SimpleQueue[Message | ProtocolError] = queue.SimpleQueue()
         self._cancelled_s: float | None = None
+        self._parted_s: float | None = None
         self._heard_hello = False
         self._ended = False
         log_path.write_bytes(b"")
@@ -83,7 +95,8 @@ class WireProcess:
                 env=clean_environment(os.environ) if environment is None else dict(environment),
                 **own_group(),
             )
-        threading.Thread(target=self._read, name="wire reader", daemon=True).start()
+        self._reader = threading.Thread(target=self._read, name="wire reader", daemon=True)
+        self._reader.start()
 
     @property
     def is_running(self) -> bool:
@@ -94,13 +107,9 @@ class WireProcess:
         """What the program said since the last call, no more than the limit at once; never waits."""
         self._climb_ladder()
         found: list[Message] = []
-        while not self._ended and len(found) < limit:
-            try:
-                item = self._messages.get_nowait()
-            except queue.Empty:
-                break
-            found.append(self._understood(item))
-            self._ended = isinstance(found[-1], Finished | Failed)
+        while not self._ended and len(found) < limit and (message := self._next_or_none()) is not None:
+            found.append(message)
+            self._ended = isinstance(message, Finished | Failed)
         return found
 
     def cancel(self) -> None:
@@ -121,10 +130,33 @@ class WireProcess:
             _kill_group(self._process)
             self._process.wait()
 
-    def _understood(self, item: Message | ProtocolError | None) -> Message:
-        """The message; a Failed for the end of the stream or a line against the protocol."""
-        if item is None:
-            return describe_crash(self._process.wait(), _tail(self._log_path))
+    def _next_or_none(self) -> Message | None:
+        """The next message; None where it is still to come."""
+        silent = not self._reader.is_alive()  # asked first: then all that it heard is on the queue
+        try:
+            return self._understood(self._messages.get_nowait())
+        except queue.Empty:
+            return self._end_or_none(silent=silent)
+
+    def _end_or_none(self, *, silent: bool) -> Failed | None:
+        """A Failed for a program that has ended without a last word, or has not but will say none."""
+        exit_code = self._process.poll()
+        if exit_code is None and not silent:
+            return None
+        if self._parted_s is None:
+            self._parted_s = time.monotonic()
+        parted = time.monotonic() - self._parted_s > PARTED_S
+        if exit_code is not None:
+            return describe_crash(exit_code, _tail(self._log_path)) if silent or parted else None
+        if not parted:
+            return None
+        _kill_group(self._process)
+        return _crashed(
+            "it fell silent and did not end, and was ended", _tail(self._log_path), _PLEASE_REPORT
+        )
+
+    def _understood(self, item: Message | ProtocolError) -> Message:
+        """The message; a Failed for a line against the protocol."""
         if isinstance(item, ProtocolError) or isinstance(item, Hello) == self._heard_hello:
             _kill_group(self._process)
             reason = item if isinstance(item, ProtocolError) else "the backend did not begin with one hello"
@@ -137,21 +169,31 @@ class WireProcess:
         return item
 
     def _read(self) -> None:
-        """Put every message on the queue, and None at the end; runs in a thread of its own."""
+        """Put every message on the queue; runs in a thread of its own, whose end is that of stdout."""
         assert self._process.stdout is not None
-        heard_message = False
-        try:
-            for line in self._process.stdout:
+        heard_message, kept_bytes = False, 0
+        with self._process.stdout as stdout:
+            while line := stdout.readline(_LONGEST_LINE_BYTES):
                 try:
-                    self._messages.put(decode(line.decode("utf-8")))
+                    message = _message_or_none(line)
+                    if message is None:
+                        continue
+                    if not isinstance(message, Progress | Heartbeat):
+                        kept_bytes += len(line)
+                    if kept_bytes > _MOST_BYTES:
+                        raise ProtocolError("it says too much")
+                    self._put(message)
                     heard_message = True
                 except (ProtocolError, UnicodeDecodeError) as error:
                     if heard_message or not self._noisy_start:
-                        self._messages.put(ProtocolError(str(error)))
-            self._process.wait()
-            self._process.stdout.close()
-        finally:
-            self._messages.put(None)  # whatever happens: who waits for the end would wait for ever
+                        self._put(ProtocolError(str(error)))
+
+    def _put(self, item: Message | ProtocolError) -> None:
+        """Onto the queue when the caller has taken enough: until then the pipe fills, not the memory."""
+        while self._messages.qsize() >= _MOST_WAITING and not self._ended:
+            time.sleep(_WAIT_S)
+        if not self._ended:
+            self._messages.put(item)
 
     def _climb_ladder(self) -> None:
         if self._cancelled_s is None or self._process.poll() is not None:
@@ -198,9 +240,25 @@ def describe_crash(exit_code: int, log_tail: str) -> Failed:
         reason = f"it was ended by {_WINDOWS_CODES[exit_code]}"
     else:
         reason = f"it ended with exit code {exit_code}"
-        remedy = "Check the installation (doctor); where it is ready, please report this with the log."
+        remedy = _PLEASE_REPORT
+    return _crashed(reason, log_tail, remedy)
+
+
+def _crashed(reason: str, log_tail: str, remedy: str) -> Failed:
     log = f"\n{log_tail}" if log_tail else ""
     return Failed(code=CRASHED, text=f"The backend ended without a result: {reason}.{log}", remedy=remedy)
+
+
+def _message_or_none(line: bytes) -> Message | None:
+    """The message of a line; None for one that its program's death has cut off.
+
+    Raises ProtocolError, or UnicodeDecodeError.
+    """
+    if not line.endswith(b"\n"):
+        if len(line) < _LONGEST_LINE_BYTES:
+            return None
+        raise ProtocolError(f"a line is longer than {_LONGEST_LINE_BYTES} bytes")
+    return decode(line.decode("utf-8"))
 
 
 def _signal_name(number: int) -> str:
@@ -211,11 +269,13 @@ def _signal_name(number: int) -> str:
 def _tail(path: Path) -> str:
     """The end of the log, in whole lines."""
     try:
-        data = path.read_bytes()
+        with path.open("rb") as file:
+            start = max(file.seek(0, os.SEEK_END) - _LOG_TAIL_BYTES, 0)
+            file.seek(start)
+            tail = file.read(_LOG_TAIL_BYTES)
     except OSError:
         return ""
-    tail = data[-_LOG_TAIL_BYTES:]
-    if len(data) > len(tail):
+    if start:
         tail = tail.partition(b"\n")[2]
     return tail.decode("utf-8", "replace").strip()
 

@@ -7,11 +7,13 @@ sides import this one file, so neither can misspell the other.
 """
 
 import json
+import math
 import os
 import types
 import typing
 from collections.abc import Callable
 from dataclasses import MISSING, asdict, dataclass, fields
+from reprlib import repr as shown
 
 T = typing.TypeVar("T")
 
@@ -173,7 +175,7 @@ def decode(line: str) -> Message:
     found = _json_object(line)
     name = found.pop("type", None)
     if not isinstance(name, str) or name not in MESSAGES:
-        raise ProtocolError(f"unknown message type {name!r}; known: {', '.join(MESSAGES)}")
+        raise ProtocolError(f"unknown message type {shown(name)}; known: {', '.join(MESSAGES)}")
     kind = MESSAGES[name]
     if kind is Hello:
         check_version(found.get("protocol"))  # first: another version may have other fields
@@ -181,8 +183,11 @@ def decode(line: str) -> Message:
 
 
 def encode_job(job: Job) -> str:
-    """The content of job.json."""
-    return json.dumps(asdict(job), indent=2, allow_nan=False, ensure_ascii=True) + "\n"
+    """The content of job.json; ProtocolError on a number that is not finite."""
+    try:
+        return json.dumps(asdict(job), indent=2, allow_nan=False, ensure_ascii=True) + "\n"
+    except ValueError as error:
+        raise ProtocolError("job: a number is not finite") from error
 
 
 def decode_job(text: str) -> Job:
@@ -193,9 +198,9 @@ def decode_job(text: str) -> Job:
     choices = (("preset", job.preset, PRESETS), ("device", job.device, DEVICES), ("until", job.until, UNTIL))
     for name, value, known in choices:
         if value not in known:
-            raise ProtocolError(f"job: {name} is {value!r}; known: {', '.join(known)}")
+            raise ProtocolError(f"job: {name} is {shown(value)}; known: {', '.join(known)}")
     if not 0 <= job.seed <= LARGEST_SEED:
-        raise ProtocolError(f"job: seed is {job.seed}; it must be from 0 to {LARGEST_SEED}")
+        raise ProtocolError(f"job: seed is {shown(job.seed)}; it must be from 0 to {LARGEST_SEED}")
     if job.budget_s is not None and job.budget_s <= 0:
         raise ProtocolError(f"job: budget_s is {job.budget_s}; it must be positive")
     _check_region(job)
@@ -204,8 +209,11 @@ def decode_job(text: str) -> Job:
 
 def check_paths(job: Job) -> None:
     """ProtocolError for one that no file can have: who only looks at a job need not mind."""
-    for path in filter(None, (*job.images, job.output, job.cameras, job.masks, job.truth)):
-        if not is_path(path):
+    named = {name: getattr(job, name) for name in ("output", "cameras", "masks", "truth")}
+    for name, path in (*(("images", image) for image in job.images), *named.items()):
+        if path is not None and not path:
+            raise ProtocolError(f"job: {name} is empty")
+        if path is not None and not is_path(path):
             raise ProtocolError(f"job: {path!r} has a letter that the path of a file cannot have")
 
 
@@ -231,7 +239,7 @@ def _check_region(job: Job) -> None:
 def check_version(found: object) -> None:
     """ProtocolError when the other side speaks another version of the protocol."""
     if found != PROTOCOL_VERSION or isinstance(found, bool):
-        raise ProtocolError(f"the other side speaks protocol {found!r}, this one {PROTOCOL_VERSION}")
+        raise ProtocolError(f"the other side speaks protocol {shown(found)}, this one {PROTOCOL_VERSION}")
 
 
 def _json_object(text: str) -> dict[str, object]:
@@ -263,7 +271,7 @@ def _record(kind: Callable[..., T], found: dict[str, object], name: str) -> T:
     missing = [field for field in missing if field not in found]
     unknown = [field for field in found if field not in hints]
     if missing or unknown:
-        raise ProtocolError(f"{name}: missing {missing}, unknown {unknown}; known: {list(hints)}")
+        raise ProtocolError(f"{name}: missing {missing}, unknown {shown(unknown)}; known: {list(hints)}")
     return kind(**{field: _value(hints[field], value, f"{name}.{field}") for field, value in found.items()})
 
 
@@ -274,14 +282,21 @@ def _value(hint: object, value: object, where: str) -> object:
         return None if value is None else _value(hint, value, where)
     if typing.get_origin(hint) is tuple:
         if not isinstance(value, list):
-            raise ProtocolError(f"{where} is {value!r}, expected a list")
+            raise ProtocolError(f"{where} is {shown(value)}, expected a list")
         item_hint = typing.get_args(hint)[0]
         return tuple(_value(item_hint, item, where) for item in value)
-    if hint is float and type(value) is int:
-        try:
-            return float(value)  # JSON writers may drop the ".0"
-        except OverflowError as error:
-            raise ProtocolError(f"{where} is larger than any float") from error
+    if hint is float and type(value) in (int, float):
+        return _finite(value, where)
     if type(value) is not hint:  # exact: a bool is no int
-        raise ProtocolError(f"{where} is {value!r}, expected {getattr(hint, '__name__', hint)}")
+        raise ProtocolError(f"{where} is {shown(value)}, expected {getattr(hint, '__name__', hint)}")
     return value
+
+
+def _finite(value: typing.Any, where: str) -> float:
+    """The number, for which JSON writers may drop the ".0"; 1e999 is read as infinity."""
+    try:
+        if math.isfinite(value):
+            return float(value)
+    except OverflowError:  # an int
+        pass
+    raise ProtocolError(f"{where} is larger than any float")

@@ -257,6 +257,13 @@ def test_the_timer_is_quick_and_comes_to_the_end(jobs: ModuleType, tmp_path: Pat
     assert 0 < jobs.longest_tick_s < TICK_LIMIT_S
 
 
+def test_a_flood_of_progress_holds_nobody_up(jobs: ModuleType, tmp_path: Path) -> None:
+    command = say(tmp_path, HELLO, *[PROGRESS] * 100_000, finished(tmp_path))
+    jobs.start("Testing", command, folder=tmp_path, log_path=tmp_path / "log", on_finished=lambda _: iter(()))
+    tick_until(jobs, lambda: jobs.ended() is not None)
+    assert jobs.ended().failure is None
+
+
 def test_cancel_is_answered_at_once(jobs: ModuleType, tmp_path: Path) -> None:
     stage = {"type": "stage", "name": "mesh", "index": 1, "count": 1}
     failed = {"type": "failed", "code": "cancelled", "text": "Stopped.", "remedy": ""}

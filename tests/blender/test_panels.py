@@ -826,3 +826,14 @@ def test_a_narrow_sidebar_breaks_lines_and_loses_no_word(sidebar: Sidebar) -> No
         icons = [drawn.icon for drawn in layout.drawn]
         assert icons == ["ERROR"] + ["BLANK1"] * (len(icons) - 1)
     assert len(icons) == 1
+
+
+def test_words_without_end_leave_room_for_the_buttons(sidebar: Sidebar) -> None:
+    """Of a program gone mad: they are drawn many times a second."""
+    endless = "word " * 200_000
+    sidebar.job(stage="mesh", stage_count=1, text=endless, warnings=[endless])
+    began = time.perf_counter()
+    drawn = sidebar.draw("main").drawn
+    assert time.perf_counter() - began < 0.05
+    assert len(drawn) < 200
+    assert sum(len(one.text) for one in drawn) < 5000

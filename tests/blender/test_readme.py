@@ -7,6 +7,7 @@ import re
 import shlex
 import subprocess
 import sys
+import zipfile
 from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
@@ -105,6 +106,49 @@ def test_a_command_runs(
         assert len(made["images"]) == 8
 
 
+TOOL = Path(bpy.utils.system_resource("SCRIPTS")) / "addons_core/bl_pkg/cli/blender_ext.py"
+"""What `blender --command extension` runs."""
+
+
+def tool(*words: str, folder: Path) -> None:
+    """Blender's tool for extensions in the folder; what it says must be no error, whatever its exit code."""
+    run = subprocess.run(
+        [sys.executable, TOOL, *words], capture_output=True, text=True, cwd=folder, timeout=60
+    )
+    assert run.returncode == 0, run.stderr
+    assert "ERROR" not in run.stdout + run.stderr
+
+
+def test_the_command_that_builds_the_extension_needs_no_folder_first(tmp_path: Path) -> None:
+    """Nothing but what a download holds: it makes no folders of its own."""
+    (command,) = re.findall(r"`blender --command extension (build[^`]*)`", SECTION)
+    (tmp_path / "addon").mkdir()
+    for path in (ROOT / "__init__.py", ROOT / "blender_manifest.toml", *(ROOT / "addon").glob("*.py")):
+        (tmp_path / path.relative_to(ROOT)).write_bytes(path.read_bytes())
+    tool(*shlex.split(command), folder=tmp_path)
+    (made,) = tmp_path.glob("*.zip")
+    assert f"`{made.name}`" in SECTION
+
+
+def test_a_zip_as_it_is_downloaded_can_be_installed(tmp_path: Path) -> None:
+    """All of the repository in one folder, as hosts of repositories give it."""
+    found = zipfile.ZipFile(tmp_path / "download.zip", "w")
+    with found:
+        for name in (
+            "__init__.py",
+            "blender_manifest.toml",
+            "pyproject.toml",
+            "constraints.txt",
+            "README.md",
+        ):
+            found.write(ROOT / name, f"fewview-main/{name}")
+        for path in (path for part in ("addon", "backend", "tests") for path in (ROOT / part).rglob("*.py")):
+            found.write(path, f"fewview-main/{path.relative_to(ROOT)}")
+    tool("install-files", "--local-dir", str(tmp_path), str(tmp_path / "download.zip"), folder=tmp_path)
+    assert (tmp_path / "fewview" / "addon" / "panels.py").is_file()
+    assert "as a ZIP" in README
+
+
 def test_there_are_examples_of_every_kind() -> None:
     assert len(PYTHON_EXAMPLES) == 3
     assert {words.split()[0] for words in COMMANDS} == {"check", "reconstruct", "render"}
@@ -132,6 +176,27 @@ def test_no_images_and_missing_ones_are_said(parts: Callable[[str], ModuleType],
 
 
 @pytest.mark.parametrize(
+    ("wrong", "said"),
+    [
+        ({"region": ((0.0, 0.0, float("nan")), 1.0)}, "not finite"),
+        ({"region": (0.0, 0.0, 0.0, 1.0)}, "a centre of three numbers and a radius"),
+        ({"region": ((0.0, 0.0), 1.0)}, "region_centre"),
+        ({"preset": "best"}, "best"),
+        ({"preset": None}, "preset"),
+        ({"seed": 2**40}, "seed"),
+        ({"seed": 1.5}, "seed"),
+        ({"seed": True}, "seed"),
+    ],
+)
+def test_arguments_that_make_no_sense_are_told_before_a_folder_is_made(
+    rehearsed: object, parts: Callable[[str], ModuleType], wrong: dict[str, Any], said: str
+) -> None:
+    with pytest.raises(ValueError, match=said):
+        parts("api").reconstruct(["photos"], output="jobs", **wrong)
+    assert not Path("jobs").exists()
+
+
+@pytest.mark.parametrize(
     ("words", "said"),
     [
         ("reconstruct nowhere --output jobs", "nowhere"),
@@ -141,6 +206,12 @@ def test_no_images_and_missing_ones_are_said(parts: Callable[[str], ModuleType],
         ("reconstruct photos --output jobs --preset best", "best"),
         ("render --object Nobody --output jobs", "Nobody"),
         ("render --object Suzanne --output photos/a.png", "a.png"),
+        ("render --object Suzanne --output jobs --views 1", "--views: must be from 2 to"),
+        ("render --object Suzanne --output jobs --views 100000", "--views: must be from 2 to"),
+        ("render --object Suzanne --output jobs --width 9000", "--width: must be from 32 to 8192"),
+        ("render --object Suzanne --output jobs --height x", "--height"),
+        ("render --object Suzanne --output jobs --samples 0", "--samples"),
+        ("render --object Suzanne --output jobs --seed -1", "--seed"),
         ("explode", "explode"),
         ("", "required"),
     ],
@@ -158,6 +229,12 @@ def test_a_users_mistake_ends_with_2(
     assert "Error: Error:" not in output.err
     assert "{" not in output.out
     assert not Path("jobs").exists()
+
+
+def test_every_option_is_explained(parts: Callable[[str], ModuleType]) -> None:
+    (commands,) = (a for a in parts("command_line")._parser()._actions if isinstance(a.choices, dict))
+    options = [(name, option) for name, parser in commands.choices.items() for option in parser._actions]
+    assert [(name, option.dest) for name, option in options if not option.help] == []
 
 
 def test_help_is_no_mistake(rehearsed: object, main: Callable[..., int]) -> None:

@@ -35,6 +35,11 @@ def test_a_stage_ends_where_the_next_begins(names: list[str]) -> None:
     assert found[2:-1:3] == pytest.approx(found[3::3])
 
 
+@pytest.mark.parametrize("num_left", [10**400, -(10**400)])
+def test_a_number_of_stages_that_cannot_be_does_no_harm(num_left: int) -> None:
+    assert 0.0 <= total_share([], "mesh", num_left, 0.5) <= 1.0
+
+
 def test_time_left_at_a_steady_pace() -> None:
     assert seconds_left(0.25, 10.0) == pytest.approx(30.0)
     assert seconds_left(0.0, 10.0) is None

@@ -81,6 +81,21 @@ def test_wrong_seeds_end_with_a_sentence(
     assert not jobs
 
 
+@pytest.mark.parametrize("words", [["photos", "--output", ""], ["", "--output", "o"]])
+def test_an_empty_path_is_told_before_anything_is_looked_for(
+    words: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert program.run(["reconstruct", *words]) == 2
+    assert "is empty" in capsys.readouterr().err
+
+
+def test_every_option_is_explained() -> None:
+    (commands,) = (action for action in program._parser()._actions if isinstance(action.choices, dict))
+    assert isinstance(commands.choices, dict)
+    options = [(name, option) for name, parser in commands.choices.items() for option in parser._actions]
+    assert [(name, option.dest) for name, option in options if not option.help] == []
+
+
 def test_install_and_remove_get_their_words(monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[Any] = []
     monkeypatch.setattr(program.install, "install", lambda plan: asked.append(plan) or 0)

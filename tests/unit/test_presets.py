@@ -106,6 +106,23 @@ def test_every_setting_is_read(record: str, field: str) -> None:
     assert (record, field) in all_settings_read()
 
 
+def numbers(value: object) -> Iterator[float]:
+    """Every number of a setting, also within tuples."""
+    if isinstance(value, int | float):
+        yield float(value)
+    elif isinstance(value, tuple):
+        for part in value:
+            yield from numbers(part)
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_numbers_of_a_preset_are_finite_and_none_is_negative(name: str) -> None:
+    for owner, record in records(PRESETS[name]):
+        for field in dataclasses.fields(record):  # type: ignore[arg-type]
+            for number in numbers(getattr(record, field.name)):
+                assert 0 <= number < float("inf"), (owner, field.name)
+
+
 def test_settings_are_told_apart_by_their_representation() -> None:
     """Checkpoints are found by it."""
     for preset in PRESETS.values():

@@ -188,6 +188,31 @@ def test_a_path_that_no_file_can_have_is_refused(name: str) -> None:
         protocol.check_paths(wrong)
 
 
+@pytest.mark.parametrize("name", ["images", "output", "cameras", "masks", "truth"])
+def test_a_path_without_a_letter_is_refused(name: str) -> None:
+    """A variable of a shell that is not set: it would be the folder of the job file, or the current one."""
+    job = Job(protocol=PROTOCOL_VERSION, images=("a",), output="o")
+    wrong = replace(job, **{name: ("a", "") if name == "images" else ""})
+    with pytest.raises(ProtocolError, match=f"{name} .*empty"):
+        protocol.check_paths(wrong)
+
+
+@pytest.mark.parametrize("number", ["1e999", "-1e999"])
+def test_a_number_beyond_all_floats_is_refused(number: str) -> None:
+    """JSON has no infinity, but numbers that are read as one."""
+    with pytest.raises(ProtocolError, match="larger than any float"):
+        decode(f'{{"type": "heartbeat", "elapsed_s": {number}}}')
+    job = f'{{"protocol": {PROTOCOL_VERSION}, "images": ["a"], "output": "o", "budget_s": {number}}}'
+    with pytest.raises(ProtocolError, match="budget_s is larger than any float"):
+        decode_job(job)
+
+
+def test_a_job_with_a_number_that_json_lacks_says_so() -> None:
+    job = Job(protocol=PROTOCOL_VERSION, images=("a",), output="o", budget_s=float("nan"))
+    with pytest.raises(ProtocolError, match="job: a number is not finite"):
+        encode_job(job)
+
+
 def test_the_wire_needs_nothing_but_the_standard_library() -> None:
     for path in Path(protocol.__file__).parent.glob("*.py"):
         for node in ast.walk(ast.parse(path.read_text())):
