@@ -83,14 +83,16 @@ def refine_lenses(
     return tuple(decisions)
 
 
+def focal_sigma(camera: pycolmap.Camera) -> float:
+    """How far off a focal length may be before photographs are asked, as a share of it."""
+    return _FOCAL_SIGMA_WITH_EXIF if camera.has_prior_focal_length else _FOCAL_SIGMA_WITHOUT
+
+
 def _prior(camera: pycolmap.Camera, focal_px: float, *, mapped_well: bool) -> Gaussian:
     """What is believed of a lens before the adjustment."""
-    if camera.has_prior_focal_length:
-        focal_sigma = _FOCAL_SIGMA_WITH_EXIF
-    else:
-        focal_sigma = _FOCAL_SIGMA_MAPPED_WELL if mapped_well else _FOCAL_SIGMA_WITHOUT
+    sigma = _FOCAL_SIGMA_MAPPED_WELL if mapped_well else focal_sigma(camera)
     centre_sigma_px = _CENTRE_SIGMA * max(camera.width, camera.height)
-    sigmas = [focal_sigma * focal_px, centre_sigma_px, centre_sigma_px, _RADIAL_SIGMA]
+    sigmas = [sigma * focal_px, centre_sigma_px, centre_sigma_px, _RADIAL_SIGMA]
     return Gaussian(
         mean=np.array([focal_px, camera.width / 2, camera.height / 2, 0.0]),
         covariance=np.diag(np.square(sigmas)),

@@ -12,6 +12,7 @@ from .features import LensGroup, picture_index, picture_name, write_pictures
 from .lens_refinement import refine_lenses
 from .lenses import PlacedPhoto, Placement, rigid_matrix, sparse_points
 from .model_choice import best_model
+from .outline_cameras import held_against_outlines
 from .parallax import require_parallax, why_none_placed, why_unplaced
 
 _FEATURE_BUDGET = 48_000
@@ -47,6 +48,8 @@ def estimate_placement(
     doubts = map(_why_not_exif, against_exif.values())
     decisions = (*features, *doubts, *refine_lenses(model, mapped_well=against_exif.keys()))
     _drop_bad_points(model)
+    model, about_outlines = held_against_outlines(model, database, photos)
+    decisions = (*decisions, *about_outlines)
     require_parallax(model, database)
     return _placement(model, photos, decisions, database)
 

@@ -1,0 +1,195 @@
+"""Estimated cameras of a subject with little texture, held against its outlines.
+
+Where hardly any feature is seen by three photographs, those that two share are mostly mistaken, and cameras
+that suit them may be anywhere. But each photograph with a mask knows an outline, and outlines of one subject
+contradict cameras that are wrong, whatever its texture (maths/outline_agreement.py).
+"""
+
+from collections.abc import Sequence
+from copy import copy
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import PIL.Image  # noqa: F401 - pycolmap loaded before Pillow corrupts memory when Pillow next saves
+import pycolmap
+from jaxtyping import Bool, Float32, Float64, Int64
+from scipy.ndimage import distance_transform_edt
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import ConvexHull
+from skimage.measure import find_contours
+
+from ..maths.outline_agreement import Silhouette
+from ..maths.outline_fit import Features, OutlineFit, fit_to_outlines, outlines_miss_px
+from ..maths.posed_views import PosedViews
+from ..scene import Decision, Photo
+from .confirmation import FEWEST_CONFIRMING
+from .features import picture_index
+from .lens_refinement import focal_sigma
+from .lenses import rigid_matrix
+from .model_merit import fewest_confirming
+
+_WHAT = "estimated cameras, held against outlines"
+_FEWEST_PHOTOS = 3
+_LEAST_MISS_PX = 0.3
+"""By which outlines miss each other for cameras to be moved: as much do masks that are off by a pixel."""
+_LARGEST_SHARE_LEFT = 0.5
+"""Of it, with cameras that are taken."""
+_FEWEST_POINTS = 8
+"""That must be left of the features, for what comes after lives on them."""
+_OFF_PX = 2.0
+"""From where its place is shown: more is no sighting of it."""
+_RAYS = 60
+"""Through each outline."""
+_SHORTEST_PX = 30
+"""Of a piece of outline: less is a speck."""
+_EDGE_PX = 1.2
+"""From the outline, where a soft mask tells it finer than by pixels."""
+
+
+def held_against_outlines(
+    model: pycolmap.Reconstruction, database: Path, photos: Sequence[Photo]
+) -> tuple[pycolmap.Reconstruction, tuple[Decision, ...]]:
+    """The model, or one whose cameras suit the outlines, and what decided it.
+
+    Only where points that three photographs see do not confirm the cameras, and each photograph that was
+    placed has a mask that shows the subject whole. Distortion is taken to be none then, for nothing tells it.
+    """
+    ids = sorted(model.reg_image_ids())
+    if len(ids) < _FEWEST_PHOTOS or fewest_confirming(model) >= FEWEST_CONFIRMING:
+        return model, ()
+    shown = [photos[picture_index(model.images[image_id].name)] for image_id in ids]
+    silhouettes = [silhouette_or_none(photo.mask) for photo in shown]
+    whole = [silhouette for silhouette in silhouettes if silhouette is not None]
+    if len(whole) < len(ids):
+        return model, ()
+    scale = np.array(
+        [
+            photo.image_srgb.shape[1] / model.cameras[model.images[image_id].camera_id].width
+            for photo, image_id in zip(shown, ids, strict=True)
+        ]
+    )
+    views = _posed(model, ids, scale)
+    before = outlines_miss_px(views, whole)
+    if before <= _LEAST_MISS_PX:
+        return model, (_left(f"they miss each other by {before:.2f} px"),)
+    seen = _sightings(database, [model.images[image_id].name for image_id in ids], scale)
+    sigma = np.array([focal_sigma(model.cameras[model.images[image_id].camera_id]) for image_id in ids])
+    fit = fit_to_outlines(views, whole, seen.features, sigma)
+    after = outlines_miss_px(fit.views, whole)
+    moved, num_points = _with_cameras(model, ids, fit, seen, scale)
+    because = f"outlines missed each other by {before:.2f} px, with cameras that suit them by {after:.2f} px"
+    if not after < _LARGEST_SHARE_LEFT * before or num_points < _FEWEST_POINTS:
+        return model, (_left(because),)
+    return moved, (Decision(what=_WHAT, choice="adjusted", because=because),)
+
+
+def _left(because: str) -> Decision:
+    return Decision(what=_WHAT, choice="left as they are", because=because)
+
+
+def silhouette_or_none(mask: Float32[np.ndarray, "height width"] | None) -> Silhouette | None:
+    """Of a mask that shows the subject whole, clear of the picture's border; else None."""
+    if mask is None:
+        return None
+    on = mask > 0.5
+    border = np.concatenate([on[0], on[-1], on[:, 0], on[:, -1]])
+    contours = find_contours(mask, 0.5)  # type: ignore[no-untyped-call]
+    pieces = [contour for contour in contours if len(contour) > _SHORTEST_PX]
+    if border.any() or not pieces:
+        return None
+    outline = np.concatenate(pieces)[:, ::-1] + 0.5
+    off: Float64[np.ndarray, "height width"] = distance_transform_edt(~on) - distance_transform_edt(on)
+    # the transform counts from pixel centre to pixel centre; the outline lies half a pixel between them
+    off -= 0.5 * np.sign(off)
+    soft = (mask > 0) & (mask < 1) & (np.abs(off) < _EDGE_PX)
+    return Silhouette(
+        outline_px=outline[np.linspace(0, len(outline) - 1, _RAYS).astype(np.int64)],
+        hull_px=outline[ConvexHull(outline).vertices],
+        off_px=np.where(soft, 0.5 - mask, off),
+    )
+
+
+def _posed(
+    model: pycolmap.Reconstruction, ids: Sequence[int], scale: Float64[np.ndarray, "views"]
+) -> PosedViews:
+    """The model's cameras over the photographs, without distortion."""
+    images = [model.images[image_id] for image_id in ids]
+    lenses = [model.cameras[image.camera_id] for image in images]
+    poses = np.array([rigid_matrix(image.cam_from_world()) for image in images])
+    _, number = np.unique([image.camera_id for image in images], return_inverse=True)
+    return PosedViews(
+        rotation=poses[:, :3, :3],
+        translation=poses[:, :3, 3],
+        focal_px=np.array([lens.focal_length for lens in lenses]) * scale,
+        centre_px=np.array([[lens.width / 2, lens.height / 2] for lens in lenses]) * scale[:, None],
+        lens=number.astype(np.int64),
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Sightings:
+    """Features that photographs share, and which of the photograph's own each is."""
+
+    features: Features
+    number: Int64[np.ndarray, "sightings"]
+
+
+def _sightings(database: Path, names: Sequence[str], scale: Float64[np.ndarray, "views"]) -> _Sightings:
+    """What is linked by matches between two photographs, but what that links twice in one."""
+    with pycolmap.Database.open(database) as opened:
+        ids = {image.name: image.image_id for image in opened.read_all_images()}
+        pixels = [np.asarray(opened.read_keypoints(ids[name]), np.float64)[:, :2] for name in names]
+        first = np.concatenate([[0], np.cumsum([len(of_one) for of_one in pixels])])
+        links = [np.zeros((0, 2), np.int64)]
+        for a, one in enumerate(names):
+            for b, other in enumerate(names[:a]):
+                if opened.exists_two_view_geometry(ids[other], ids[one]):
+                    pair = opened.read_two_view_geometry(ids[other], ids[one])
+                    links.append(np.asarray(pair.inlier_matches, np.int64) + first[[b, a]])
+    view = np.repeat(np.arange(len(names)), np.diff(first))
+    linked = np.concatenate(links)
+    graph = coo_array((np.ones(len(linked)), tuple(linked.T)), shape=(first[-1], first[-1]))
+    _, group = connected_components(graph, directed=False)
+    in_view = np.zeros((group.max(initial=-1) + 1, len(names)), np.int64)
+    np.add.at(in_view, (group, view), 1)
+    is_place = (in_view.max(axis=1) == 1) & (in_view.sum(axis=1) >= 2)
+    kept: Bool[np.ndarray, "features"] = is_place[group]
+    _, place = np.unique(group[kept], return_inverse=True)
+    scaled = np.concatenate(pixels) * scale[view, None]
+    features = Features(view=view[kept], pixels=scaled[kept], place=place.astype(np.int64))
+    return _Sightings(features=features, number=(np.arange(len(view)) - first[view])[kept])
+
+
+def _with_cameras(
+    model: pycolmap.Reconstruction,
+    ids: Sequence[int],
+    fit: OutlineFit,
+    seen: _Sightings,
+    scale: Float64[np.ndarray, "views"],
+) -> tuple[pycolmap.Reconstruction, int]:
+    """A model with the cameras that were found, and places that they see as points; how many these are."""
+    moved, views, features = copy(model), fit.views, seen.features
+    for point_id in list(moved.points3D):
+        moved.delete_point3D(point_id)
+    for view, image_id in enumerate(ids):
+        image = moved.images[image_id]
+        lens = moved.cameras[image.camera_id]
+        lens.params = [views.focal_px[view] / scale[view], lens.width / 2, lens.height / 2, 0.0]
+        pose = np.concatenate([views.rotation[view], views.translation[view, :, None]], axis=1)
+        assert image.frame is not None  # of one that is placed
+        image.frame.set_cam_from_world(image.camera_id, pycolmap.Rigid3d(pose))
+    _, depth = views.shown(features.view, fit.places[features.place])
+    is_seen = (np.linalg.norm(fit.beside_px(features), axis=1) < _OFF_PX) & (depth > 0)
+    num_points = 0
+    for place, position in enumerate(fit.places):
+        rows = np.flatnonzero((features.place == place) & is_seen)
+        if len(rows) >= 2:
+            track = pycolmap.Track()
+            for row in rows:
+                track.add_element(ids[features.view[row]], int(seen.number[row]))
+            moved.add_point3D(position, track)
+            num_points += 1
+    moved.update_point_3d_errors()
+    return moved, num_points
