@@ -62,6 +62,7 @@ def photos(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     pose = np.diag([1.0, -1.0, -1.0, 1.0]).tolist()
     frames = []
     for index in range(5):
+        pixels[12, 16, 0] = index  # else they were copies
         Image.fromarray(pixels).save(images / f"{index}.png")
         frames.append({"file_path": f"images/{index}.png", "transform_matrix": pose})
     cameras = {"w": 32, "h": 24, "fl_x": 30.0, "fl_y": 30.0, "cx": 16.0, "cy": 12.0, "frames": frames}
