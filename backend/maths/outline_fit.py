@@ -9,7 +9,7 @@ from jaxtyping import Float64, Int64
 from .outline_agreement import Lines, Silhouette, incoherences, tangencies
 from .posed_views import POSE, PosedViews
 
-_STAGES = ((4.0, 3.0), (1.0, 2.0), (0.5, 1.0))
+_STAGES = ((4.0, 3.0), (1.0, 2.0), (0.25, 0.5))
 """Pixels within which outlines and features agree, one after the other: cameras that are far off have to come
 near before what is exact can be asked of them."""
 _STEPS = 40
@@ -60,10 +60,18 @@ class _Asked:
     silhouettes: Sequence[Silhouette]
     features: Features
     focal_px: Float64[np.ndarray, "views"]
-    """What is expected, to a share of this."""
+    """What is expected."""
     focal_sigma: Float64[np.ndarray, "views"]
+    """To what share of it."""
+    lens: Int64[np.ndarray, "views"]
     outlines_px: float
     features_px: float
+
+    @property
+    def focal_weight(self) -> Float64[np.ndarray, "views"]:
+        """Of each view's focal length; together those of a lens count as one."""
+        sharing = np.bincount(self.lens)[self.lens]
+        return np.asarray(1 / (self.focal_sigma**2 * sharing))
 
     def lines(self, views: PosedViews) -> tuple[Lines, Lines]:
         """Tangent planes, and rays that miss the subject."""
@@ -74,7 +82,7 @@ class _Asked:
         """Half squares where errors are small, logarithms of them where they are large."""
         tangents, rays = (np.log1p((found.beside_px / self.outlines_px) ** 2).sum() for found in lines)
         off2 = (fit.beside_px(self.features) ** 2).sum(axis=1) / self.features_px**2
-        focal = ((np.log(fit.views.focal_px / self.focal_px) / self.focal_sigma) ** 2).sum()
+        focal = (self.focal_weight * np.log(fit.views.focal_px / self.focal_px) ** 2).sum()
         return float(tangents + _RAY_WEIGHT * rays + self.features_px**2 * np.log1p(off2).sum() + focal)
 
 
@@ -96,6 +104,7 @@ def fit_to_outlines(
             features=features,
             focal_px=views.focal_px,
             focal_sigma=focal_sigma,
+            lens=views.lens,
             outlines_px=outlines_px,
             features_px=features_px,
         )
@@ -152,8 +161,8 @@ class _Equations:
             left += weighed.T @ change
             right += weighed.T @ found.beside_px
         focal = POSE * len(views.focal_px) + views.lens
-        np.add.at(left, (focal, focal), 1 / asked.focal_sigma**2)
-        np.add.at(right, focal, np.log(views.focal_px / asked.focal_px) / asked.focal_sigma**2)
+        np.add.at(left, (focal, focal), asked.focal_weight)
+        np.add.at(right, focal, asked.focal_weight * np.log(views.focal_px / asked.focal_px))
         beside = fit.beside_px(features)
         by_step, by_place = views.change_of_shown(features.view, fit.places[features.place])
         weight = 1 / (1 + (beside**2).sum(axis=1) / asked.features_px**2)
