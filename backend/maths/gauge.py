@@ -14,10 +14,11 @@ import numpy as np
 from jaxtyping import Float64
 
 
-def cross_matrix(vector: Float64[np.ndarray, "3"]) -> Float64[np.ndarray, "3 3"]:
-    """[a], so that [a] b is the cross product of a and b."""
-    x, y, z = vector
-    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+def cross_matrix(vectors: Float64[np.ndarray, "*batch 3"]) -> Float64[np.ndarray, "*batch 3 3"]:
+    """[a] of each, so that [a] b is the cross product of a and b."""
+    half = np.zeros((*vectors.shape, 3))
+    half[..., 1, 0], half[..., 2, 1], half[..., 0, 2] = vectors[..., 2], vectors[..., 0], vectors[..., 1]
+    return np.asarray(half - np.swapaxes(half, -1, -2))
 
 
 def similarity_motions(positions: Float64[np.ndarray, "cameras 3"]) -> Float64[np.ndarray, "coordinates 7"]:

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float64, Int64
 
+from .lines import nearest_to_lines
 from .outline_agreement import Lines, Silhouette, incoherences, tangencies
 from .posed_views import POSE, PosedViews
 
@@ -199,33 +200,14 @@ class _Equations:
 def _places(views: PosedViews, features: Features) -> Float64[np.ndarray, "places 3"]:
     """Nearest to the rays of their sightings."""
     rays = np.einsum("kji,kj->ki", views.rotation[features.view], views.rays(features.view, features.pixels))
-    return _nearest_to_rays(views.positions[features.view], rays, features.place, features.num_places)
-
-
-def _nearest_to_rays(
-    origins: Float64[np.ndarray, "rays 3"],
-    rays: Float64[np.ndarray, "rays 3"],
-    place: Int64[np.ndarray, "rays"],
-    num_places: int,
-) -> Float64[np.ndarray, "places 3"]:
-    rays = rays / np.linalg.norm(rays, axis=1, keepdims=True)
-    off_ray = np.eye(3) - rays[:, :, None] * rays[:, None, :]
-    left, right = np.zeros((num_places, 3, 3)), np.zeros((num_places, 3))
-    np.add.at(left, place, off_ray)
-    np.add.at(right, place, np.einsum("kab,kb->ka", off_ray, origins))
-    # rays that are nearly parallel tell no depth: it is that of the middle of all cameras then
-    middle = origins.mean(axis=0) if len(origins) else np.zeros(3)
-    nearest: Float64[np.ndarray, "places 3"] = np.linalg.solve(
-        left + _HELD * np.eye(3), (right + _HELD * middle)[:, :, None]
-    )[:, :, 0]
-    return nearest
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    return nearest_to_lines(views.positions[features.view], rays, features.place)
 
 
 def _depths(views: PosedViews, silhouettes: Sequence[Silhouette]) -> tuple[float, float]:
     """Nearest and farthest that the subject may be from a camera."""
     axes = views.rotation[:, 2]
-    one = np.zeros(len(axes), np.int64)
-    middle = _nearest_to_rays(views.positions, axes, one, 1)
+    middle = nearest_to_lines(views.positions, axes)
     distance = np.einsum("vi,vi->v", axes, middle - views.positions)
     half_widths = [
         np.linalg.norm(s.hull_px - s.hull_px.mean(axis=0), axis=1).max() * d / f

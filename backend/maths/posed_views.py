@@ -10,6 +10,8 @@ import numpy as np
 from jaxtyping import Float64, Int64
 from scipy.spatial.transform import Rotation
 
+from .gauge import cross_matrix
+
 POSE = 6
 
 
@@ -68,22 +70,21 @@ class PosedViews:
     ) -> tuple[Float64[np.ndarray, "places 2"], Float64[np.ndarray, "places"]]:
         """The pixel at which each place's view shows it, and its depth; nonsense unless that is > 0."""
         in_camera = self._in_camera(view, places)
-        depth = in_camera[:, 2]
-        across = in_camera[:, :2] / np.where(depth > 0, depth, 1.0)[:, None]
-        return self.focal_px[view, None] * across + self.centre_px[view], depth
+        across = in_camera[:, :2] / _in_front(in_camera)
+        return self.focal_px[view, None] * across + self.centre_px[view], in_camera[:, 2]
 
     def change_of_shown(
         self, view: Int64[np.ndarray, "places"], places: Float64[np.ndarray, "places 3"]
     ) -> tuple[Float64[np.ndarray, "places 2 unknowns"], Float64[np.ndarray, "places 2 3"]]:
         """How the pixel changes with a step of the views, the places held, and with the place."""
         in_camera = self._in_camera(view, places)
-        across = in_camera[:, :2] / in_camera[:, 2:]
+        across = in_camera[:, :2] / _in_front(in_camera)
         change = np.zeros((len(view), 2, 3))
         change[:, 0, 0] = change[:, 1, 1] = 1.0
         change[:, :, 2] = -across
-        change *= (self.focal_px[view] / in_camera[:, 2])[:, None, None]
+        change *= (self.focal_px[view, None] / _in_front(in_camera))[:, :, None]
         by_step = np.zeros((len(view), 2, self.num_unknowns))
-        _add(by_step, POSE * view, -change @ _cross(in_camera))
+        _add(by_step, POSE * view, -change @ cross_matrix(in_camera))
         _add(by_step, POSE * view + 3, change)
         _add(by_step, self._lens_column(view), (self.focal_px[view, None] * across)[:, :, None])
         return by_step, change @ self.rotation[view]
@@ -98,7 +99,7 @@ class PosedViews:
         in_camera = depth[:, None] * self.rays(view, pixels)
         back = self.rotation[view].transpose(0, 2, 1)
         by_step = np.zeros((len(view), 3, self.num_unknowns))
-        _add(by_step, POSE * view, back @ _cross(in_camera))
+        _add(by_step, POSE * view, back @ cross_matrix(in_camera))
         _add(by_step, POSE * view + 3, -back)
         in_camera[:, 2] = 0.0
         _add(by_step, self._lens_column(view), -back @ in_camera[:, :, None])
@@ -125,9 +126,6 @@ def _add(
     to[rows, :, columns] += block.transpose(0, 2, 1)
 
 
-def _cross(vectors: Float64[np.ndarray, "rows 3"]) -> Float64[np.ndarray, "rows 3 3"]:
-    """[a] of each, so that [a] b is the cross product of a and b."""
-    crosses = np.zeros((len(vectors), 3, 3))
-    x, y, z = vectors.T
-    crosses[:, 0, 1], crosses[:, 0, 2], crosses[:, 1, 2] = -z, y, -x
-    return crosses - crosses.transpose(0, 2, 1)
+def _in_front(in_camera: Float64[np.ndarray, "places 3"]) -> Float64[np.ndarray, "places 1"]:
+    """Depths; 1 for what is not in front, which no division is to make infinite."""
+    return np.where(in_camera[:, 2:] > 0, in_camera[:, 2:], 1.0)

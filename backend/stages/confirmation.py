@@ -14,6 +14,9 @@ FEWEST_CONFIRMING = 30
 """Of the photograph with the fewest. Measured (docs/benchmarks.md): with 35 and more, orientations were right
 to 1.7 degrees, with 19 and fewer wrong by 1 to 60."""
 
+HELD_AGAINST_OUTLINES, ADJUSTED = "estimated cameras, held against outlines", "adjusted"
+"""A decision of `outline_cameras`, and its choice where cameras were moved."""
+
 _ONE_PLACE = 0.015
 """Of the distance to the points: cameras nearer to each other, as those of a burst, stand in one place. They
 see a point less than a degree apart."""
@@ -57,9 +60,16 @@ def unconfirmed(solved: SolvedCameras) -> str | None:
     weakest = int(confirming.argmin())
     if confirming[weakest] >= FEWEST_CONFIRMING:
         return None
+    few = f"of {solved.views[weakest].name} only {confirming[weakest]} points are seen by three photographs"
+    enough = f"from different places ({FEWEST_CONFIRMING} confirm a camera)"
+    if any((d.what, d.choice) == (HELD_AGAINST_OUTLINES, ADJUSTED) for d in solved.decisions):
+        return (
+            f"The cameras rest on the subject's outlines and may be a degree or two off: {few} {enough}. "
+            "More photographs, or something with texture around the subject, would help."
+        )
+    masks = "" if all(view.mask is not None for view in solved.views) else ", or masks of the whole subject"
     return (
-        f"The cameras may be wrong, and the shape with them: of {solved.views[weakest].name} only "
-        f"{confirming[weakest]} points are seen by three photographs from different places "
-        f"({FEWEST_CONFIRMING} confirm a camera). "
-        "Photographs 10 to 20 degrees apart, and something with texture around the subject, would help."
+        f"The cameras may be wrong, and the shape with them: {few} {enough}. "
+        "Photographs 10 to 20 degrees apart, and something with texture around the subject"
+        f"{masks}, would help."
     )

@@ -5,10 +5,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 from jaxtyping import Float, Float32, Float64, Int64, Shaped
-from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 
 from ..maths.geometry import Pinhole, pinhole_in_object
+from ..maths.outline_distance import outline_distance_px
 from ..scene import Region, StereoResult, View
 
 SURE = 0.3
@@ -132,7 +132,4 @@ def _outline(mask: Float32[np.ndarray, "height width"]) -> Float32[np.ndarray, "
     on = mask > 0.5
     if on.all() or not on.any():
         return np.where(on, -1e4, 1e4).astype(np.float32)
-    signed: Float32[np.ndarray, "height width"] = distance_transform_edt(~on) - distance_transform_edt(on)
-    # the transform counts from pixel centre to pixel centre; the outline lies half a pixel between them
-    between: Float32[np.ndarray, "height width"] = (signed - 0.5 * np.sign(signed)).astype(np.float32)
-    return between
+    return outline_distance_px(on).astype(np.float32)

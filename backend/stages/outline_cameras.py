@@ -14,23 +14,22 @@ import numpy as np
 import PIL.Image  # noqa: F401 - pycolmap loaded before Pillow corrupts memory when Pillow next saves
 import pycolmap
 from jaxtyping import Bool, Float32, Float64, Int64
-from scipy.ndimage import distance_transform_edt
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import ConvexHull
 from skimage.measure import find_contours
 
 from ..maths.outline_agreement import Silhouette
+from ..maths.outline_distance import outline_distance_px
 from ..maths.outline_fit import Features, OutlineFit, fit_to_outlines, outlines_miss_px
 from ..maths.posed_views import PosedViews
 from ..scene import Decision, Photo
-from .confirmation import FEWEST_CONFIRMING
+from .confirmation import ADJUSTED, FEWEST_CONFIRMING, HELD_AGAINST_OUTLINES
 from .features import picture_index
 from .lens_refinement import focal_sigma
 from .lenses import rigid_matrix
 from .model_merit import fewest_confirming
 
-_WHAT = "estimated cameras, held against outlines"
 _FEWEST_PHOTOS = 3
 _LEAST_MISS_PX = 0.3
 """By which outlines miss each other for cameras to be moved: as much do masks that are off by a pixel."""
@@ -82,11 +81,11 @@ def held_against_outlines(
     because = f"outlines missed each other by {before:.2f} px, with cameras that suit them by {after:.2f} px"
     if not after < _LARGEST_SHARE_LEFT * before or num_points < _FEWEST_POINTS:
         return model, (_left(because),)
-    return moved, (Decision(what=_WHAT, choice="adjusted", because=because),)
+    return moved, (Decision(what=HELD_AGAINST_OUTLINES, choice=ADJUSTED, because=because),)
 
 
 def _left(because: str) -> Decision:
-    return Decision(what=_WHAT, choice="left as they are", because=because)
+    return Decision(what=HELD_AGAINST_OUTLINES, choice="left as they are", because=because)
 
 
 def silhouette_or_none(mask: Float32[np.ndarray, "height width"] | None) -> Silhouette | None:
@@ -100,9 +99,7 @@ def silhouette_or_none(mask: Float32[np.ndarray, "height width"] | None) -> Silh
     if border.any() or not pieces:
         return None
     outline = np.concatenate(pieces)[:, ::-1] + 0.5
-    off: Float64[np.ndarray, "height width"] = distance_transform_edt(~on) - distance_transform_edt(on)
-    # the transform counts from pixel centre to pixel centre; the outline lies half a pixel between them
-    off -= 0.5 * np.sign(off)
+    off = outline_distance_px(on)
     soft = (mask > 0) & (mask < 1) & (np.abs(off) < _EDGE_PX)
     return Silhouette(
         outline_px=outline[np.linspace(0, len(outline) - 1, _RAYS).astype(np.int64)],

@@ -15,6 +15,7 @@ from jaxtyping import Bool, Float64, Int64
 from scipy.ndimage import label
 
 from ..errors import ErrorCode, ReconstructionError
+from ..maths.lines import nearest_to_lines
 from ..maths.projection import in_picture, projected, shown
 from ..scene import Camera, Decision, Progress, Region, SolvedCameras, View, to_unit_sphere
 from .standing_alone import share_cut_off, standing_alone
@@ -182,16 +183,7 @@ def _overviews(cameras: list[Camera]) -> list[Camera]:
 def nearest_to_axes(cameras: list[Camera]) -> Float64[np.ndarray, "3"]:
     """The point with the least squared distance to all optical axes."""
     axes = np.array([camera.camera_from_world[2, :3] for camera in cameras])
-    return _nearest_to_lines(np.array([camera.position for camera in cameras]), axes)
-
-
-def _nearest_to_lines(
-    origins: Float64[np.ndarray, "lines 3"], directions: Float64[np.ndarray, "lines 3"]
-) -> Float64[np.ndarray, "3"]:
-    """The point with the least squared distance to lines of unit directions."""
-    across = np.eye(3) - directions[:, :, None] * directions[:, None]
-    right = (across @ origins[:, :, None]).sum(axis=0)[:, 0]
-    return np.asarray(np.linalg.lstsq(across.sum(axis=0), right, rcond=1e-9)[0])
+    return np.asarray(nearest_to_lines(np.array([camera.position for camera in cameras]), axes)[0])
 
 
 def _shown_whole(cameras: list[Camera]) -> tuple[Float64[np.ndarray, "3"], float]:
@@ -358,7 +350,7 @@ def _first_guess(views: list[View]) -> tuple[Float64[np.ndarray, "3"], float]:
         directions.append(direction / np.linalg.norm(direction))
         sizes_px.append(float(np.hypot(columns + 0.5 - middle[0], rows + 0.5 - middle[1]).max()))
     cameras = [view.camera for view in views]
-    centre = _nearest_to_lines(np.array([camera.position for camera in cameras]), np.array(directions))
+    centre = nearest_to_lines(np.array([camera.position for camera in cameras]), np.array(directions))[0]
     depths = [np.linalg.norm(centre - camera.position) / camera.fx_px for camera in cameras]
     return centre, 1.5 * float(np.multiply(depths, sizes_px).max())
 

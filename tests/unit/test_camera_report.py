@@ -19,7 +19,13 @@ from backend.stages.camera_report import (
     camera_report_numbers,
     point_angles_deg,
 )
-from backend.stages.confirmation import FEWEST_CONFIRMING, num_confirming, unconfirmed
+from backend.stages.confirmation import (
+    ADJUSTED,
+    FEWEST_CONFIRMING,
+    HELD_AGAINST_OUTLINES,
+    num_confirming,
+    unconfirmed,
+)
 from tests.synthetic_scene import (
     DISTANCE,
     OBJECT_UNIT,
@@ -130,6 +136,26 @@ def test_cameras_that_no_third_photograph_confirms_are_doubted() -> None:
     assert remark == unconfirmed(weak)
     assert f"only {FEWEST_CONFIRMING - 1} points" in remark
     assert unconfirmed(replace(weak, evidence=None)) is None
+
+
+def test_cameras_that_rest_on_outlines_are_doubted_less() -> None:
+    weak = replace(
+        solved(), unplaced=(), evidence=all_strong(), sparse_visibility=np.zeros((80, 3), np.bool_)
+    )
+    decided = Decision(what=HELD_AGAINST_OUTLINES, choice=ADJUSTED, because="outlines missed each other")
+    held = unconfirmed(replace(weak, decisions=(decided,)))
+    assert held is not None
+    assert held.startswith("The cameras rest on the subject's outlines")
+    left = unconfirmed(replace(weak, decisions=(replace(decided, choice="left as they are"),)))
+    assert left is not None
+    assert left.startswith("The cameras may be wrong")
+    whole = tuple(replace(view, mask=np.ones(view.image_srgb.shape[:2], np.float32)) for view in weak.views)
+    masked = unconfirmed(replace(weak, views=whole))
+    assert masked is not None
+    assert "masks" not in masked
+    bare = unconfirmed(replace(weak, views=tuple(replace(view, mask=None) for view in weak.views)))
+    assert bare is not None
+    assert "or masks of the whole subject, would help" in bare
 
 
 @pytest.mark.parametrize("apart", [0.0, 0.01])
