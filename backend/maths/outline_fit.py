@@ -1,6 +1,6 @@
 """Cameras that suit the outlines of their subject, and the features that photographs share."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -92,11 +92,12 @@ def fit_to_outlines(
     silhouettes: Sequence[Silhouette],
     features: Features,
     focal_sigma: Float64[np.ndarray, "views"],
+    on_step: Callable[[], None] = lambda: None,
 ) -> OutlineFit:
     """The nearest views in which outlines and most features agree, both by a Cauchy loss.
 
     Focal lengths are expected where they are, to a share of focal_sigma. Steps are Levenberg's and
-    Marquardt's, with lines found anew after each.
+    Marquardt's, with lines found anew after each; before one `on_step` is called, which may raise.
     """
     fit = OutlineFit(views=views, places=_places(views, features))
     for outlines_px, features_px in _STAGES:
@@ -109,7 +110,7 @@ def fit_to_outlines(
             outlines_px=outlines_px,
             features_px=features_px,
         )
-        fit = _descended(asked, fit)
+        fit = _descended(asked, fit, on_step)
     return fit
 
 
@@ -120,10 +121,11 @@ def outlines_miss_px(views: PosedViews, silhouettes: Sequence[Silhouette]) -> fl
     return float(np.sqrt((rays.beside_px**2).sum() / num_rays))
 
 
-def _descended(asked: _Asked, fit: OutlineFit) -> OutlineFit:
+def _descended(asked: _Asked, fit: OutlineFit, on_step: Callable[[], None]) -> OutlineFit:
     damping, lines = 1e-3, asked.lines(fit.views)
     cost = asked.cost(fit, lines)
     for _ in range(_STEPS):
+        on_step()
         equations = _Equations.of(asked, fit, lines)
         before = cost
         for _ in range(_DAMPINGS):

@@ -5,7 +5,7 @@ that suit them may be anywhere. But each photograph with a mask knows an outline
 contradict cameras that are wrong, whatever its texture (maths/outline_agreement.py).
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from copy import copy
 from dataclasses import dataclass
 from pathlib import Path
@@ -48,7 +48,7 @@ _EDGE_PX = 1.2
 
 
 def held_against_outlines(
-    model: pycolmap.Reconstruction, database: Path, photos: Sequence[Photo]
+    model: pycolmap.Reconstruction, database: Path, photos: Sequence[Photo], on_step: Callable[[], None]
 ) -> tuple[pycolmap.Reconstruction, tuple[Decision, ...]]:
     """The model, or one whose cameras suit the outlines, and what decided it.
 
@@ -75,7 +75,7 @@ def held_against_outlines(
         return model, (_left(f"they miss each other by {before:.2f} px"),)
     seen = _sightings(database, [model.images[image_id].name for image_id in ids], scale)
     sigma = np.array([focal_sigma(model.cameras[model.images[image_id].camera_id]) for image_id in ids])
-    fit = fit_to_outlines(views, whole, seen.features, sigma)
+    fit = fit_to_outlines(views, whole, seen.features, sigma, on_step)
     after = outlines_miss_px(fit.views, whole)
     moved, num_points = _with_cameras(model, ids, fit, seen, scale)
     because = f"outlines missed each other by {before:.2f} px, with cameras that suit them by {after:.2f} px"

@@ -1,6 +1,7 @@
 """Cameras from the photographs alone, by pycolmap's incremental mapping, set up for few photographs."""
 
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 import PIL.Image  # noqa: F401 - pycolmap loaded before Pillow corrupts memory when Pillow next saves
@@ -48,7 +49,8 @@ def estimate_placement(
     doubts = map(_why_not_exif, against_exif.values())
     decisions = (*features, *doubts, *refine_lenses(model, mapped_well=against_exif.keys()))
     _drop_bad_points(model)
-    model, about_outlines = held_against_outlines(model, database, photos)
+    on_step = partial(progress, 0.98, "Holding cameras against outlines")
+    model, about_outlines = held_against_outlines(model, database, photos, on_step)
     decisions = (*decisions, *about_outlines)
     require_parallax(model, database)
     return _placement(model, photos, decisions, database)

@@ -230,7 +230,11 @@ def posed(model: pycolmap.Reconstruction, views: PosedViews) -> PosedViews:
 def test_a_model_is_adjusted(views: PosedViews, scene: Scene, tmp_path: Path) -> None:
     wrong, features = misplaced(views), shared_features(views, 60, mistaken=6)
     model, photos = model_of(wrong, scene, features, tmp_path / "features.db")
-    adjusted, (decision,) = held_against_outlines(model, tmp_path / "features.db", photos)
+    steps: list[None] = []
+    adjusted, (decision,) = held_against_outlines(
+        model, tmp_path / "features.db", photos, lambda: steps.append(None)
+    )
+    assert len(steps) > 5
     assert decision.choice == "adjusted"
     assert worst_rotation_deg(posed(adjusted, views), views) < 1.5
     assert worst_rotation_deg(posed(model, views), wrong) < 1e-6  # which is as it was
@@ -252,7 +256,7 @@ def test_a_model_that_is_left(why: str, views: PosedViews, scene: Scene, tmp_pat
     if why == "two photographs":
         for image_id in sorted(model.reg_image_ids())[2:]:
             model.deregister_frame(model.images[image_id].frame_id)
-    kept, decisions = held_against_outlines(model, tmp_path / "features.db", photos)
+    kept, decisions = held_against_outlines(model, tmp_path / "features.db", photos, lambda: None)
     assert kept is model
     assert [decision.choice for decision in decisions] == ["left as they are"] * (why == "good enough")
     assert all(decision.because.startswith("they miss each other by 0.0") for decision in decisions)
