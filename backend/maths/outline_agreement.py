@@ -16,6 +16,7 @@ from jaxtyping import Bool, Float64, Int64
 
 from .bilinear import bilinear
 from .posed_views import PosedViews
+from .silhouette import Silhouette
 
 _DEPTHS = 48
 """Tried along a ray; then twice as many steps of an eighth around the best."""
@@ -25,18 +26,6 @@ _TOLERATED_PX = 0.1
 """Off the subject: outlines are not known better."""
 _LARGEST_SPAN = 2.6
 """Radians that a silhouette takes of the planes through two cameras: more, and it may hold the epipole."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Silhouette:
-    """Of the subject in one photograph, which shows it whole."""
-
-    outline_px: Float64[np.ndarray, "outline 2"]
-    """Places along it."""
-    hull_px: Float64[np.ndarray, "corners 2"]
-    """Corners of its convex hull."""
-    off_px: Float64[np.ndarray, "height width"]
-    """Signed distance to the outline, > 0 off the subject."""
 
 
 @dataclass(frozen=True, kw_only=True)

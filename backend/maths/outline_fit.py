@@ -7,8 +7,9 @@ import numpy as np
 from jaxtyping import Float64, Int64
 
 from .lines import nearest_to_lines
-from .outline_agreement import Lines, Silhouette, incoherences, tangencies
+from .outline_agreement import Lines, incoherences, tangencies
 from .posed_views import POSE, PosedViews
+from .silhouette import Silhouette
 
 _STAGES = ((4.0, 3.0), (1.0, 2.0), (0.25, 0.5))
 """Pixels within which outlines and features agree, one after the other: cameras that are far off have to come

@@ -4,12 +4,14 @@ Each camera has six numbers of its own, a turn and a shift in its own axes (R <-
 and each lens the logarithm of its focal length.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float64, Int64
 from scipy.spatial.transform import Rotation
 
+from ..scene import Camera
 from .gauge import cross_matrix
 
 POSE = 6
@@ -113,6 +115,17 @@ class PosedViews:
 
     def _lens_column(self, view: Int64[np.ndarray, "places"]) -> Int64[np.ndarray, "places"]:
         return np.asarray(POSE * len(self.rotation) + self.lens[view])
+
+
+def posed_views(cameras: Sequence[Camera]) -> PosedViews:
+    """The cameras, each with a lens of its own whose focal length is the mean of its two."""
+    return PosedViews(
+        rotation=np.array([camera.camera_from_world[:3, :3] for camera in cameras]),
+        translation=np.array([camera.camera_from_world[:3, 3] for camera in cameras]),
+        focal_px=np.array([(camera.fx_px + camera.fy_px) / 2 for camera in cameras]),
+        centre_px=np.array([[camera.cx_px, camera.cy_px] for camera in cameras]),
+        lens=np.arange(len(cameras)),
+    )
 
 
 def _add(

@@ -8,7 +8,7 @@ from jaxtyping import Float, Float32, Float64, Int64, Shaped
 from torch import Tensor
 
 from ..maths.geometry import Pinhole, pinhole_in_object
-from ..maths.outline_distance import outline_distance_px
+from ..maths.silhouette import outline_distance_px
 from ..scene import Region, StereoResult, View
 
 SURE = 0.3

@@ -13,16 +13,13 @@ from pathlib import Path
 import numpy as np
 import PIL.Image  # noqa: F401 - pycolmap loaded before Pillow corrupts memory when Pillow next saves
 import pycolmap
-from jaxtyping import Bool, Float32, Float64, Int64
+from jaxtyping import Bool, Float64, Int64
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
-from scipy.spatial import ConvexHull
-from skimage.measure import find_contours
 
-from ..maths.outline_agreement import Silhouette
-from ..maths.outline_distance import outline_distance_px
 from ..maths.outline_fit import Features, OutlineFit, fit_to_outlines, outlines_miss_px
 from ..maths.posed_views import PosedViews
+from ..maths.silhouette import silhouette_or_none
 from ..scene import Decision, Photo
 from .confirmation import ADJUSTED, FEWEST_CONFIRMING, HELD_AGAINST_OUTLINES
 from .features import picture_index
@@ -39,12 +36,6 @@ _FEWEST_POINTS = 8
 """That must be left of the features, for what comes after lives on them."""
 _OFF_PX = 2.0
 """From where its place is shown: more is no sighting of it."""
-_RAYS = 60
-"""Through each outline."""
-_SHORTEST_PX = 30
-"""Of a piece of outline: less is a speck."""
-_EDGE_PX = 1.2
-"""From the outline, where a soft mask tells it finer than by pixels."""
 
 
 def held_against_outlines(
@@ -86,26 +77,6 @@ def held_against_outlines(
 
 def _left(because: str) -> Decision:
     return Decision(what=HELD_AGAINST_OUTLINES, choice="left as they are", because=because)
-
-
-def silhouette_or_none(mask: Float32[np.ndarray, "height width"] | None) -> Silhouette | None:
-    """Of a mask that shows the subject whole, clear of the picture's border; else None."""
-    if mask is None:
-        return None
-    on = mask > 0.5
-    border = np.concatenate([on[0], on[-1], on[:, 0], on[:, -1]])
-    contours = find_contours(mask, 0.5)  # type: ignore[no-untyped-call]
-    pieces = [contour for contour in contours if len(contour) > _SHORTEST_PX]
-    if border.any() or not pieces:
-        return None
-    outline = np.concatenate(pieces)[:, ::-1] + 0.5
-    off = outline_distance_px(on)
-    soft = (mask > 0) & (mask < 1) & (np.abs(off) < _EDGE_PX)
-    return Silhouette(
-        outline_px=outline[np.linspace(0, len(outline) - 1, _RAYS).astype(np.int64)],
-        hull_px=outline[ConvexHull(outline).vertices],
-        off_px=np.where(soft, 0.5 - mask, off),
-    )
 
 
 def _posed(

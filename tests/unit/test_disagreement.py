@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from backend.scene import Camera, SolvedCameras, StereoResult, no_progress
 from backend.stages.camera_refinement import match_solved
-from backend.stages.disagreement import disagreement
+from backend.stages.disagreement import disagreement, outlines_of_masks_miss_px
 from backend.stages.stereo_config import StereoConfig
 from tests.synthetic_scene import CENTRE, Scene, arc_cameras, photographed, true_region
 
@@ -41,7 +41,10 @@ def test_a_camera_that_is_turned_is_named() -> None:
     pose = np.eye(4)
     pose[:3, :3] = Rotation.from_euler("y", 10, degrees=True).as_matrix()
     turned = replace(first, camera_from_world=pose @ first.camera_from_world)
-    (text,) = told([turned, *others])
+    text, of_outlines = told([turned, *others])
+    assert of_outlines.startswith(
+        "With the cameras that were given the outlines of the masks miss each other"
+    )
     assert text.startswith("Hardly anything that view_00.png shows is found at the same place by another")
 
 
@@ -60,5 +63,35 @@ def test_a_camera_that_stands_elsewhere_is_told() -> None:
 def test_focal_lengths_that_are_wrong_are_told() -> None:
     """Ten times too long: the photographs agree all the same."""
     longer = [replace(camera, fx_px=10 * camera.fx_px, fy_px=10 * camera.fy_px) for camera in scene().cameras]
-    (text,) = told(longer)
+    text, of_outlines = told(longer)
     assert text.startswith("The cameras that were given do not fit the photographs")
+    assert of_outlines.startswith(
+        "With the cameras that were given the outlines of the masks miss each other"
+    )
+
+
+def test_without_texture_outlines_tell() -> None:
+    """The cameras lie where they should, turned about their own axes: nothing is measured anyway."""
+    plain = photographed(scene().cameras, textured=False)
+    assert plain.views[0].mask is not None
+    right = outlines_of_masks_miss_px(plain.views)
+    rolled = [
+        replace(view, camera=replace(view.camera, camera_from_world=rolled_by(angle) @ pose))
+        for view, angle, pose in zip(
+            plain.views, (5, -4, 3, -5), (view.camera.camera_from_world for view in plain.views), strict=True
+        )
+    ]
+    wrong = outlines_of_masks_miss_px(rolled)
+    assert right is not None
+    assert wrong is not None
+    assert right < 0.1
+    assert wrong > 0.8
+    assert outlines_of_masks_miss_px([*rolled[1:], replace(rolled[0], mask=None)]) is None
+    assert outlines_of_masks_miss_px(rolled[:2]) is None
+
+
+def rolled_by(angle_deg: float) -> np.ndarray:
+    """A turn about the optical axis."""
+    turn = np.eye(4)
+    turn[:3, :3] = Rotation.from_euler("z", angle_deg, degrees=True).as_matrix()
+    return turn

@@ -10,12 +10,13 @@ import pytest
 from jaxtyping import Float64
 from scipy.spatial.transform import Rotation
 
-from backend.maths.outline_agreement import Silhouette, incoherences, tangencies
+from backend.maths.outline_agreement import incoherences, tangencies
 from backend.maths.outline_fit import Features, fit_to_outlines, outlines_miss_px
-from backend.maths.posed_views import POSE, PosedViews
+from backend.maths.posed_views import POSE, PosedViews, posed_views
+from backend.maths.silhouette import Silhouette, silhouette_or_none
 from backend.scene import Photo
 from backend.stages.features import picture_name
-from backend.stages.outline_cameras import held_against_outlines, silhouette_or_none
+from backend.stages.outline_cameras import held_against_outlines
 from tests.synthetic_scene import CENTRE, SIZE, Scene, arc_cameras, photographed, surface_points
 
 NUM_VIEWS = 5
@@ -25,9 +26,9 @@ NEAREST, FARTHEST = 2.0 * SIZE, 6.0 * SIZE
 
 @pytest.fixture(scope="module")
 def scene() -> Scene:
-    """Through lenses that look straight ahead."""
-    cameras = arc_cameras(NUM_VIEWS, 110, 480)
-    return photographed([replace(c, cx_px=c.width / 2, cy_px=c.height / 2) for c in cameras])
+    """Through lenses that look straight ahead, with square pixels."""
+    cameras = arc_cameras(NUM_VIEWS, 110, 960)
+    return photographed([replace(c, fy_px=c.fx_px, cx_px=c.width / 2, cy_px=c.height / 2) for c in cameras])
 
 
 @pytest.fixture(scope="module")
@@ -39,14 +40,7 @@ def silhouettes(scene: Scene) -> list[Silhouette]:
 @pytest.fixture(scope="module")
 def views(scene: Scene) -> PosedViews:
     """The true ones, of one lens."""
-    cameras = scene.cameras
-    return PosedViews(
-        rotation=np.array([camera.camera_from_world[:3, :3] for camera in cameras]),
-        translation=np.array([camera.camera_from_world[:3, 3] for camera in cameras]),
-        focal_px=np.array([camera.fx_px for camera in cameras]),
-        centre_px=np.array([[camera.cx_px, camera.cy_px] for camera in cameras]),
-        lens=np.zeros(len(cameras), np.int64),
-    )
+    return replace(posed_views(scene.cameras), lens=np.zeros(NUM_VIEWS, np.int64))
 
 
 def misplaced(views: PosedViews, seed: int = 0) -> PosedViews:
