@@ -18,6 +18,7 @@ from .records import load_record
 from .results import RADIANCE, Writers
 from .scene import Camera, Progress, within
 from .stages.known_cameras import read_cameras
+from .stages.nerfstudio import CAMERAS
 from .stages.radiance_field import Radiance, restored
 from .stages.radiance_image import RadianceImage, radiance_image
 from .wire.protocol import is_path
@@ -38,7 +39,7 @@ def render_job(job: Path, cameras: Path, output: Path, device: str, progress: Pr
     """
     draw = _drawing(job, device)
     named = _by_file_name(read_cameras(cameras))
-    if (output / "cameras.json").exists():
+    if (output / CAMERAS).exists():
         raise ReconstructionError(
             ErrorCode.OUTPUT_UNUSABLE,
             f"{output} holds the results of a reconstruction.",

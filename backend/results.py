@@ -11,7 +11,7 @@ from .mesh_files import SPARSE, TEXTURE, png_of, write_glb, write_mesh, write_po
 from .records import save_record
 from .scene import Region, SolvedCameras
 from .stages.camera_report import CameraReport, camera_report_html, camera_report_numbers
-from .stages.nerfstudio import transforms_json
+from .stages.nerfstudio import CAMERAS, transforms_json
 from .stages.radiance_field import Radiance
 from .stages.report import Report, render_report_html, report_numbers
 from .workspace import LOG, Workspace
@@ -113,7 +113,7 @@ def _camera_writers(solved: SolvedCameras, region: Region) -> Writers:
     positions, visibility = solved.sparse_positions, solved.sparse_visibility
     colours = mean_colours(solved.views, positions, visibility)
     return {
-        "cameras.json": _text(_json(transforms_json(solved, region))),
+        CAMERAS: _text(_json(transforms_json(solved, region))),
         SPARSE: partial(write_sparse, positions=positions, colours_srgb=colours, visibility=visibility),
     }
 

@@ -17,6 +17,7 @@ from ..properties import IN_BLEND, settings_of
 from ..scenes import reason_against_changes, scene_name_of, scene_named
 from .environment import backend_python_or_reason
 from .images import used_images
+from .polling import speaks_nothing_against
 from .reconstruct import jobs_parent
 
 
@@ -43,16 +44,10 @@ class FEWVIEW_OT_estimate_cameras(bpy.types.Operator):
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
         """A backend, no other job, and a scene that takes the cameras."""
-        if reason := reason_against_changes(context.scene):
-            cls.poll_message_set(reason)
-            return False
-        if jobs.running() is not None:
-            cls.poll_message_set("Wait for the running job, or cancel it")
-            return False
-        python, reason = backend_python_or_reason(context)
-        if python is None:
-            cls.poll_message_set(reason)
-        return python is not None
+        reason = reason_against_changes(context.scene)
+        if not reason and jobs.running() is not None:
+            reason = "Wait for the running job, or cancel it"
+        return speaks_nothing_against(cls, reason or backend_python_or_reason(context)[1])
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         """Start the backend."""
@@ -117,10 +112,7 @@ class FEWVIEW_OT_import_cameras(bpy.types.Operator):
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
         """A scene that takes them."""
-        reason = reason_against_changes(context.scene)
-        if reason:
-            cls.poll_message_set(reason)
-        return not reason
+        return speaks_nothing_against(cls, reason_against_changes(context.scene))
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         """Import all at once."""

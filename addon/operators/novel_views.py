@@ -23,6 +23,7 @@ from ..solved import SolvedCamera, write_cameras
 from ..view_rendering import IMAGES, TRANSFORMS
 from .environment import backend_python_or_reason, reason_against_a_job
 from .on_result import OnResult, Status, has_result, refused, result_of
+from .polling import speaks_nothing_against
 
 _LONGEST_NAME = 60
 """Letters, of up to four bytes each."""
@@ -57,9 +58,7 @@ class FEWVIEW_OT_render_novel_views(OnResult, bpy.types.Operator):
             reason = "The files of the job are gone: reconstruct again"
         if not reason and not has_camera(context.scene):
             reason = "Add a camera first"
-        if reason:
-            cls.poll_message_set(reason)
-        return not reason
+        return speaks_nothing_against(cls, reason)
 
     def execute(self, context: bpy.types.Context) -> Status:
         """Write the cameras and start; without a window, wait for the end."""

@@ -15,6 +15,7 @@ from ..properties import settings_of
 from ..result_import import import_fit_steps
 from ..scenes import reason_against_changes, scene_name_of
 from .environment import backend_python_or_reason, reason_against_a_job
+from .polling import speaks_nothing_against
 from .reconstruct import IN_PAST_JOBS, jobs_parent
 
 
@@ -38,9 +39,7 @@ class FEWVIEW_OT_fit_points(bpy.types.Operator):
         if not reason and context.mode != "OBJECT":
             reason = "Change to Object Mode first"
         reason = reason or reason_against(context.active_object)
-        if reason:
-            cls.poll_message_set(reason)
-        return not reason
+        return speaks_nothing_against(cls, reason)
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         """Write the points and start; without a window, wait for the end."""

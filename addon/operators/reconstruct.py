@@ -33,6 +33,7 @@ from ..solved import read_solved
 from ..state_lines import FEWEST_IMAGES
 from .environment import backend_python_or_reason, reason_against_a_job
 from .images import used_images
+from .polling import speaks_nothing_against
 
 _LOG_TEXT = "fewview_log"
 """Custom property of the text block with the log."""
@@ -116,9 +117,7 @@ class FEWVIEW_OT_reconstruct(bpy.types.Operator):
     def poll(cls, context: bpy.types.Context) -> bool:
         """Not twice at once, not without a backend, and not into a scene that takes no mesh."""
         reason = reason_against_changes(context.scene) or reason_against_a_job(context)
-        if reason:
-            cls.poll_message_set(reason)
-        return not reason
+        return speaks_nothing_against(cls, reason)
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         """Start; without a window, wait for the end."""

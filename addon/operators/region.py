@@ -10,6 +10,7 @@ from .. import region
 from ..mesh_import import select_alone
 from ..scenes import reason_against_changes
 from .on_result import Status
+from .polling import speaks_nothing_against
 
 
 class FEWVIEW_OT_add_region(bpy.types.Operator):
@@ -35,9 +36,7 @@ class FEWVIEW_OT_add_region(bpy.types.Operator):
         reason = reason_against_changes(context.scene)
         if not reason and region.region_or_none(context.scene) is not None:
             reason = "There is a region already: scale it, or fit it"
-        if reason:
-            cls.poll_message_set(reason)
-        return not reason
+        return speaks_nothing_against(cls, reason)
 
     def execute(self, context: bpy.types.Context) -> Status:
         sphere, source = region.guess(context.scene)
@@ -58,10 +57,7 @@ class FEWVIEW_OT_fit_region(bpy.types.Operator):
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        reason = reason_against_changes(context.scene)
-        if reason:
-            cls.poll_message_set(reason)
-        return not reason
+        return speaks_nothing_against(cls, reason_against_changes(context.scene))
 
     def execute(self, context: bpy.types.Context) -> Status:
         try:

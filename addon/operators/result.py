@@ -15,6 +15,7 @@ from ..result_mesh import result_or_none
 from ..scenes import reason_against_changes
 from .measure import FEWVIEW_OT_measure_error
 from .on_result import OnResult, Status, has_result, refused, result_of
+from .polling import speaks_nothing_against
 from .reconstruct import jobs_parent
 from .result_files import (
     FEWVIEW_OT_export,
@@ -47,9 +48,7 @@ class FEWVIEW_OT_import_result(bpy.types.Operator):
         reason = reason_against_changes(context.scene)
         if not reason and context.mode != "OBJECT":
             reason = "Change to Object Mode first"
-        if reason:
-            cls.poll_message_set(reason)
-        return not reason
+        return speaks_nothing_against(cls, reason)
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> Status:
         if self.folder:

@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int64
 
 from .bilinear import bilinear
+from .lines import nearest_along
 from .posed_views import PosedViews
 from .silhouette import Silhouette
 
@@ -65,6 +66,8 @@ def tangencies(views: PosedViews, silhouettes: Sequence[Silhouette]) -> Lines:
     found = [_no_lines()]
     for a, b in combinations(range(len(silhouettes)), 2):
         axis = views.positions[b] - views.positions[a]
+        if not axis.any():  # from one place all planes are told, and none of them
+            continue
         of_a = _touched(views, silhouettes[a], a, axis=axis, other=b)
         of_b = _touched(views, silhouettes[b], b, axis=axis, other=a)
         if of_a is not None and of_b is not None:
@@ -84,8 +87,7 @@ def _touched(
 ) -> Float64[np.ndarray, "2 2"] | None:
     """Corners of the hull touched by the first and the last plane around the axis; None if it holds that."""
     corners = silhouette.hull_px
-    of_view = np.full(len(corners), view)
-    directions = views.rays(of_view, corners) @ views.rotation[view]
+    directions = views.directions(np.full(len(corners), view), corners)
     middle = views.rotation[view][2] + views.rotation[other][2]
     out = middle - axis * (middle @ axis) / (axis @ axis)
     side = np.cross(axis, out) / np.linalg.norm(axis)
@@ -103,11 +105,8 @@ def _beside_epipolar_lines(
     other_pixels: Float64[np.ndarray, "pairs 2"],
 ) -> Lines:
     """How far the pixels' epipolar lines pass beside those of the other views; of rays that meet in front."""
-    there = views.positions[other] - views.positions[view]
-    ray = np.einsum("kji,kj->ki", views.rotation[view], views.rays(view, pixels))
-    other_ray = np.einsum("kji,kj->ki", views.rotation[other], views.rays(other, other_pixels))
-    across = np.cross(ray, other_ray)
-    depth = (np.cross(there, other_ray) * across).sum(axis=1) / (across**2).sum(axis=1)
+    apart = views.positions[other] - views.positions[view]
+    depth = nearest_along(apart, views.directions(view, pixels), views.directions(other, other_pixels))
     kept = depth > 0
     view, pixels, other, depth = view[kept], pixels[kept], other[kept], depth[kept]
     shown, in_front = views.shown(other, views.places(view, pixels, depth))

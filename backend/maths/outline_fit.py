@@ -61,19 +61,22 @@ class _Asked:
 
     silhouettes: Sequence[Silhouette]
     features: Features
-    focal_px: Float64[np.ndarray, "views"]
-    """What is expected."""
+    expected: PosedViews
+    """Of these the focal lengths."""
     focal_sigma: Float64[np.ndarray, "views"]
-    """To what share of it."""
-    lens: Int64[np.ndarray, "views"]
+    """To what share of them."""
     outlines_px: float
     features_px: float
 
     @property
     def focal_weight(self) -> Float64[np.ndarray, "views"]:
         """Of each view's focal length; together those of a lens count as one."""
-        sharing = np.bincount(self.lens)[self.lens]
+        sharing = np.bincount(self.expected.lens)[self.expected.lens]
         return np.asarray(1 / (self.focal_sigma**2 * sharing))
+
+    def log_focal(self, views: PosedViews) -> Float64[np.ndarray, "views"]:
+        """How far focal lengths are from what is expected, as logarithms."""
+        return np.asarray(np.log(views.focal_px / self.expected.focal_px))
 
     def lines(self, views: PosedViews) -> tuple[Lines, Lines]:
         """Tangent planes, and rays that miss the subject."""
@@ -84,7 +87,7 @@ class _Asked:
         """Half squares where errors are small, logarithms of them where they are large."""
         tangents, rays = (np.log1p((found.beside_px / self.outlines_px) ** 2).sum() for found in lines)
         off2 = (fit.beside_px(self.features) ** 2).sum(axis=1) / self.features_px**2
-        focal = (self.focal_weight * np.log(fit.views.focal_px / self.focal_px) ** 2).sum()
+        focal = (self.focal_weight * self.log_focal(fit.views) ** 2).sum()
         return float(tangents + _RAY_WEIGHT * rays + self.features_px**2 * np.log1p(off2).sum() + focal)
 
 
@@ -105,9 +108,8 @@ def fit_to_outlines(
         asked = _Asked(
             silhouettes=silhouettes,
             features=features,
-            focal_px=views.focal_px,
+            expected=views,
             focal_sigma=focal_sigma,
-            lens=views.lens,
             outlines_px=outlines_px,
             features_px=features_px,
         )
@@ -166,7 +168,7 @@ class _Equations:
             right += weighed.T @ found.beside_px
         focal = POSE * len(views.focal_px) + views.lens
         np.add.at(left, (focal, focal), asked.focal_weight)
-        np.add.at(right, focal, asked.focal_weight * np.log(views.focal_px / asked.focal_px))
+        np.add.at(right, focal, asked.focal_weight * asked.log_focal(views))
         beside = fit.beside_px(features)
         by_step, by_place = views.change_of_shown(features.view, fit.places[features.place])
         weight = 1 / (1 + (beside**2).sum(axis=1) / asked.features_px**2)
@@ -202,7 +204,7 @@ class _Equations:
 
 def _places(views: PosedViews, features: Features) -> Float64[np.ndarray, "places 3"]:
     """Nearest to the rays of their sightings."""
-    rays = np.einsum("kji,kj->ki", views.rotation[features.view], views.rays(features.view, features.pixels))
+    rays = views.directions(features.view, features.pixels)
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
     return nearest_to_lines(views.positions[features.view], rays, features.place)
 

@@ -1,7 +1,7 @@
 """Connected pieces: of a mesh by its edges, of a depth map or a picture by neighbouring pixels."""
 
 import numpy as np
-from jaxtyping import Bool, Int, Int32, Int64
+from jaxtyping import Bool, Int, Int32, Int64, Shaped
 from scipy.ndimage import label
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
@@ -17,6 +17,10 @@ def connected_pieces(pairs: Int[np.ndarray, "2 pairs"], count: int) -> Int64[np.
 def whole_pieces(pixels: Bool[np.ndarray, "height width"]) -> Int32[np.ndarray, "height width"]:
     """A number for each piece of the pixels that are set; 0 off them, and in pieces that the border cuts."""
     pieces, _ = label(pixels)
-    at_border = np.concatenate([pieces[0], pieces[-1], pieces[:, 0], pieces[:, -1]])
-    whole: Int32[np.ndarray, "height width"] = np.where(np.isin(pieces, at_border), 0, pieces)
+    whole: Int32[np.ndarray, "height width"] = np.where(np.isin(pieces, along_border(pieces)), 0, pieces)
     return whole
+
+
+def along_border(pixels: Shaped[np.ndarray, "height width"]) -> Shaped[np.ndarray, "border"]:
+    """Those at the picture's border, the corners twice."""
+    return np.concatenate([pixels[0], pixels[-1], pixels[:, 0], pixels[:, -1]])

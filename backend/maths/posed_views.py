@@ -57,6 +57,12 @@ class PosedViews:
         across = (pixels - self.centre_px[view]) / self.focal_px[view, None]
         return np.concatenate([across, np.ones((len(pixels), 1))], axis=1)
 
+    def directions(
+        self, view: Int64[np.ndarray, "rays"], pixels: Float64[np.ndarray, "rays 2"]
+    ) -> Float64[np.ndarray, "rays 3"]:
+        """Of the same rays, world frame."""
+        return self._turned_back(view, self.rays(view, pixels))
+
     def places(
         self,
         view: Int64[np.ndarray, "rays"],
@@ -64,8 +70,7 @@ class PosedViews:
         depth: Float64[np.ndarray, "rays"],
     ) -> Float64[np.ndarray, "rays 3"]:
         """At that depth on the pixels' rays, world frame."""
-        in_camera = depth[:, None] * self.rays(view, pixels) - self.translation[view]
-        return np.asarray(np.einsum("kji,kj->ki", self.rotation[view], in_camera))
+        return self._turned_back(view, depth[:, None] * self.rays(view, pixels) - self.translation[view])
 
     def shown(
         self, view: Int64[np.ndarray, "places"], places: Float64[np.ndarray, "places 3"]
@@ -106,6 +111,12 @@ class PosedViews:
         in_camera[:, 2] = 0.0
         _add(by_step, self._lens_column(view), -back @ in_camera[:, :, None])
         return by_step
+
+    def _turned_back(
+        self, view: Int64[np.ndarray, "places"], vectors: Float64[np.ndarray, "places 3"]
+    ) -> Float64[np.ndarray, "places 3"]:
+        """From the axes of their views to the world's."""
+        return np.asarray(np.einsum("kji,kj->ki", self.rotation[view], vectors))
 
     def _in_camera(
         self, view: Int64[np.ndarray, "places"], places: Float64[np.ndarray, "places 3"]

@@ -1,5 +1,6 @@
 """What a mask tells of the outline of its subject."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -8,6 +9,10 @@ from scipy.ndimage import distance_transform_edt
 from scipy.spatial import ConvexHull
 from skimage.measure import find_contours
 
+from .pieces import along_border
+
+_FEWEST = 3
+"""Outlines of two photographs hardly say anything of each other."""
 _RAYS = 60
 """Through each outline."""
 _SHORTEST_PX = 30
@@ -28,15 +33,23 @@ class Silhouette:
     """Signed distance to the outline, > 0 off the subject."""
 
 
+def silhouettes_or_none(
+    masks: Iterable[Float32[np.ndarray, "height width"] | None],
+) -> tuple[Silhouette, ...] | None:
+    """Of three masks or more that all show their subject whole; else None."""
+    found = [silhouette_or_none(mask) for mask in masks]
+    silhouettes = tuple(silhouette for silhouette in found if silhouette is not None)
+    return silhouettes if len(silhouettes) >= max(len(found), _FEWEST) else None
+
+
 def silhouette_or_none(mask: Float32[np.ndarray, "height width"] | None) -> Silhouette | None:
     """Of a mask that shows the subject whole, clear of the picture's border; else None."""
     if mask is None:
         return None
     on = mask > 0.5
-    border = np.concatenate([on[0], on[-1], on[:, 0], on[:, -1]])
     contours = find_contours(mask, 0.5)  # type: ignore[no-untyped-call]
     pieces = [contour for contour in contours if len(contour) > _SHORTEST_PX]
-    if border.any() or not pieces:
+    if along_border(on).any() or not pieces:
         return None
     outline = np.concatenate(pieces)[:, ::-1] + 0.5
     off = outline_distance_px(on)

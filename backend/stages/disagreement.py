@@ -9,7 +9,7 @@ import numpy as np
 
 from ..maths.outline_fit import outlines_miss_px
 from ..maths.posed_views import posed_views
-from ..maths.silhouette import silhouette_or_none
+from ..maths.silhouette import silhouettes_or_none
 from ..scene import SolvedCameras, StereoResult, View
 from ..wire.photographs import first_names
 
@@ -22,7 +22,6 @@ epipolar lines; with a camera moved by 10 degrees, or focal lengths ten times to
 _MISS_WIDTHS = 1.5e-3
 """Of the longer side: outlines of rendered masks miss each other by less than 1e-4 with true cameras, by 4e-4
 where masks are off by a pixel of 800, by 3.4e-3 with cameras that are 9 degrees off."""
-_FEWEST_OUTLINES = 3
 
 
 def disagreement(solved: SolvedCameras, stereo: StereoResult) -> tuple[str, ...]:
@@ -51,9 +50,8 @@ def disagreement(solved: SolvedCameras, stereo: StereoResult) -> tuple[str, ...]
 
 def outlines_of_masks_miss_px(views: Sequence[View]) -> float | None:
     """How far outlines of one subject miss each other; None unless three masks and all show it whole."""
-    found = [silhouette_or_none(view.mask) for view in views]
-    silhouettes = [silhouette for silhouette in found if silhouette is not None]
-    if len(silhouettes) < max(len(views), _FEWEST_OUTLINES):
+    silhouettes = silhouettes_or_none(view.mask for view in views)
+    if silhouettes is None:
         return None
     return outlines_miss_px(posed_views([view.camera for view in views]), silhouettes)
 

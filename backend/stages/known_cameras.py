@@ -16,7 +16,15 @@ from ..mesh_files import SPARSE, MeshFileError, read_sparse
 from ..scene import Camera, Decision, Photo, Unplaced
 from ..wire.photographs import first_names, is_named, spelling
 from .lenses import PlacedPhoto, Placement, rigid_matrix, sparse_points, undistorted_view
-from .nerfstudio import Estimate, estimate_or_none, frame_lens, is_ours, read_frames, world_from_camera
+from .nerfstudio import (
+    CAMERAS,
+    Estimate,
+    estimate_or_none,
+    frame_lens,
+    is_ours,
+    read_frames,
+    world_from_camera,
+)
 from .stored_pixels import is_of_stored_pixels, turned_upright
 
 _ROTATION_TOLERANCE = 5e-3
@@ -25,8 +33,6 @@ _ROTATION_TOLERANCE = 5e-3
 LARGEST_SIDE_PX = 20_000
 """Of a picture to render: 400 million pixels are a slip of the pen."""
 
-_OURS = "cameras.json"
-"""What a finished run leaves."""
 _NOTHING: Mapping[int, str] = MappingProxyType({})
 _CHECK = "Check that the cameras belong to these photographs."
 
@@ -158,8 +164,8 @@ def cameras_source(given: Path) -> Path:
     for folder in (given, given / "sparse" / "0", given / "sparse", given / "0"):
         if any((folder / f"cameras{suffix}").is_file() for suffix in (".bin", ".txt")):
             return folder
-    if (given / _OURS).is_file():
-        return given / _OURS
+    if (given / CAMERAS).is_file():
+        return given / CAMERAS
     text = f"There are no cameras in {given}."
     raise _unusable(
         text, "Give a nerfstudio transforms.json, or the folder of a COLMAP model or a finished run."

@@ -23,6 +23,8 @@ from ..errors import ErrorCode, ReconstructionError
 from ..scene import Lens, Photo, Region, SolvedCameras, View
 from .lenses import FISHEYE_TERMS, PERSPECTIVE_TERMS, colmap_lens
 
+CAMERAS = "cameras.json"
+"""What a finished run leaves of its cameras."""
 OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 """Camera axes: OpenGL has y up and looks along -z. Its own inverse."""
 

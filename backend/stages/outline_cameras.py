@@ -14,12 +14,11 @@ import numpy as np
 import PIL.Image  # noqa: F401 - pycolmap loaded before Pillow corrupts memory when Pillow next saves
 import pycolmap
 from jaxtyping import Bool, Float64, Int64
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from ..maths.outline_fit import Features, OutlineFit, fit_to_outlines, outlines_miss_px
+from ..maths.pieces import connected_pieces
 from ..maths.posed_views import PosedViews
-from ..maths.silhouette import silhouette_or_none
+from ..maths.silhouette import silhouettes_or_none
 from ..scene import Decision, Photo
 from .confirmation import ADJUSTED, FEWEST_CONFIRMING, HELD_AGAINST_OUTLINES
 from .features import picture_index
@@ -27,7 +26,6 @@ from .lens_refinement import focal_sigma
 from .lenses import rigid_matrix
 from .model_merit import fewest_confirming
 
-_FEWEST_PHOTOS = 3
 _LEAST_MISS_PX = 0.3
 """By which outlines miss each other for cameras to be moved: as much do masks that are off by a pixel."""
 _LARGEST_SHARE_LEFT = 0.5
@@ -47,27 +45,24 @@ def held_against_outlines(
     placed has a mask that shows the subject whole. Distortion is taken to be none then, for nothing tells it.
     """
     ids = sorted(model.reg_image_ids())
-    if len(ids) < _FEWEST_PHOTOS or fewest_confirming(model) >= FEWEST_CONFIRMING:
+    if fewest_confirming(model) >= FEWEST_CONFIRMING:
         return model, ()
-    shown = [photos[picture_index(model.images[image_id].name)] for image_id in ids]
-    silhouettes = [silhouette_or_none(photo.mask) for photo in shown]
-    whole = [silhouette for silhouette in silhouettes if silhouette is not None]
-    if len(whole) < len(ids):
+    images = [model.images[image_id] for image_id in ids]
+    lenses = [model.cameras[image.camera_id] for image in images]
+    shown = [photos[picture_index(image.name)] for image in images]
+    silhouettes = silhouettes_or_none(photo.mask for photo in shown)
+    if silhouettes is None:
         return model, ()
-    scale = np.array(
-        [
-            photo.image_srgb.shape[1] / model.cameras[model.images[image_id].camera_id].width
-            for photo, image_id in zip(shown, ids, strict=True)
-        ]
-    )
-    views = _posed(model, ids, scale)
-    before = outlines_miss_px(views, whole)
+    widths_px = [photo.image_srgb.shape[1] for photo in shown]
+    scale = np.array([width_px / lens.width for width_px, lens in zip(widths_px, lenses, strict=True)])
+    views = _posed(images, lenses, scale)
+    before = outlines_miss_px(views, silhouettes)
     if before <= _LEAST_MISS_PX:
         return model, (_left(f"they miss each other by {before:.2f} px"),)
-    seen = _sightings(database, [model.images[image_id].name for image_id in ids], scale)
-    sigma = np.array([focal_sigma(model.cameras[model.images[image_id].camera_id]) for image_id in ids])
-    fit = fit_to_outlines(views, whole, seen.features, sigma, on_step)
-    after = outlines_miss_px(fit.views, whole)
+    seen = _sightings(database, [image.name for image in images], scale)
+    sigma = np.array([focal_sigma(lens) for lens in lenses])
+    fit = fit_to_outlines(views, silhouettes, seen.features, sigma, on_step)
+    after = outlines_miss_px(fit.views, silhouettes)
     moved, num_points = _with_cameras(model, ids, fit, seen, scale)
     because = f"outlines missed each other by {before:.2f} px, with cameras that suit them by {after:.2f} px"
     if not after < _LARGEST_SHARE_LEFT * before or num_points < _FEWEST_POINTS:
@@ -80,11 +75,9 @@ def _left(because: str) -> Decision:
 
 
 def _posed(
-    model: pycolmap.Reconstruction, ids: Sequence[int], scale: Float64[np.ndarray, "views"]
+    images: Sequence[pycolmap.Image], lenses: Sequence[pycolmap.Camera], scale: Float64[np.ndarray, "views"]
 ) -> PosedViews:
-    """The model's cameras over the photographs, without distortion."""
-    images = [model.images[image_id] for image_id in ids]
-    lenses = [model.cameras[image.camera_id] for image in images]
+    """The images' cameras over the photographs, without distortion."""
     poses = np.array([rigid_matrix(image.cam_from_world()) for image in images])
     _, number = np.unique([image.camera_id for image in images], return_inverse=True)
     return PosedViews(
@@ -117,9 +110,7 @@ def _sightings(database: Path, names: Sequence[str], scale: Float64[np.ndarray, 
                     pair = opened.read_two_view_geometry(ids[other], ids[one])
                     links.append(np.asarray(pair.inlier_matches, np.int64) + first[[b, a]])
     view = np.repeat(np.arange(len(names)), np.diff(first))
-    linked = np.concatenate(links)
-    graph = coo_array((np.ones(len(linked)), tuple(linked.T)), shape=(first[-1], first[-1]))
-    _, group = connected_components(graph, directed=False)
+    group = connected_pieces(np.concatenate(links).T, int(first[-1]))
     in_view = np.zeros((group.max(initial=-1) + 1, len(names)), np.int64)
     np.add.at(in_view, (group, view), 1)
     is_place = (in_view.max(axis=1) == 1) & (in_view.sum(axis=1) >= 2)

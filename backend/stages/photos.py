@@ -10,6 +10,7 @@ from jaxtyping import Float32
 
 from ..errors import ErrorCode, ReconstructionError
 from ..images import DecodedImage, read_image, resized, same_shape, upright
+from ..maths.pieces import along_border
 from ..scene import Photo, Progress
 from ..wire.photographs import (
     KINDS,
@@ -233,7 +234,7 @@ def _share_along_edges(alpha: Float32[np.ndarray, "height width"]) -> float:
     inner = alpha[inset : height - inset, inset : width - inset] > 0.5
     if min(inner.shape, default=0) < 2:
         return 0.0
-    return float(np.concatenate([inner[0], inner[-1], inner[:, 0], inner[:, -1]]).mean())
+    return float(along_border(inner).mean())
 
 
 def _load_mask(path: Path, photo_name: str, photo: DecodedImage) -> Float32[np.ndarray, "height width"]:

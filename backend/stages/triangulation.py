@@ -8,6 +8,7 @@ import pycolmap
 from jaxtyping import Bool, Float64
 
 from ..images import fitted_size, resized
+from ..maths.lines import nearest_along
 from ..scene import Camera, Progress, View
 from .features import (
     LensGroup,
@@ -91,18 +92,14 @@ def two_view_points(
     """
     ray_a, ray_b = _rays(a, pixels_a), _rays(b, pixels_b)
     apart = b.position - a.position
-    # by cross products: 1 - cosine^2 has no digits left where rays are nearly parallel
-    across = np.cross(ray_a, ray_b)
-    sine2 = (across**2).sum(axis=1)
-    inverse = 1 / np.where(sine2 > 0, sine2, 1.0)
-    along_a = (np.cross(apart, ray_b) * across).sum(axis=1) * inverse
-    along_b = (np.cross(apart, ray_a) * across).sum(axis=1) * inverse
+    along_a, along_b = nearest_along(apart, ray_a, ray_b), nearest_along(-apart, ray_b, ray_a)
     on_a, on_b = a.position + along_a[:, None] * ray_a, b.position + along_b[:, None] * ray_b
     gap = np.linalg.norm(on_a - on_b, axis=1) / 2
     good = (along_a > 0) & (along_b > 0)
     # else it is no point anyway: cameras in one place have all of them at 0
     far_a, far_b = np.where(good, along_a, 1.0), np.where(good, along_b, 1.0)
     good &= np.maximum(gap * a.fx_px / far_a, gap * b.fx_px / far_b) < largest_error_px
+    sine2 = (np.cross(ray_a, ray_b) ** 2).sum(axis=1)
     good &= sine2 > np.sin(np.deg2rad(_SMALLEST_ANGLE_DEG)) ** 2
     return (on_a + on_b) / 2, good
 

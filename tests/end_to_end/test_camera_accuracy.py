@@ -1,7 +1,6 @@
 """Cameras found from real photographs, against surveyed and published ones."""
 
 import json
-import math
 from itertools import combinations
 from pathlib import Path
 
@@ -15,6 +14,7 @@ from backend.stages.cameras import CamerasConfig, solve_cameras
 from backend.stages.confirmation import FEWEST_CONFIRMING, num_confirming, unconfirmed
 from backend.stages.nerfstudio import OPENCV_FROM_OPENGL
 from backend.stages.photos import PhotosConfig, load_photos
+from tests.relative_rotations import rotation_errors_deg
 
 DATA = Path(__file__).resolve().parents[2] / ".." / "shared" / "data"
 
@@ -30,22 +30,12 @@ def solve(paths: list[Path], workdir: Path) -> SolvedCameras:
 
 
 def true_poses(transforms: Path) -> dict[str, np.ndarray]:
-    """world_from_camera by file name."""
+    """camera_from_world by file name."""
     frames = json.loads(transforms.read_text())["frames"]
     return {
-        Path(frame["file_path"]).name: np.array(frame["transform_matrix"]) @ OPENCV_FROM_OPENGL
+        Path(frame["file_path"]).name: np.linalg.inv(np.array(frame["transform_matrix"]) @ OPENCV_FROM_OPENGL)
         for frame in frames
     }
-
-
-def rotation_errors_deg(ours: list[np.ndarray], true: list[np.ndarray]) -> np.ndarray:
-    """Of the rotation between each two cameras: no alignment enters."""
-    errors = []
-    for i, j in combinations(range(len(ours)), 2):
-        relative = ours[i][:3, :3].T @ ours[j][:3, :3]
-        true_relative = true[i][:3, :3].T @ true[j][:3, :3]
-        errors.append(math.degrees(Rotation.from_matrix(relative.T @ true_relative).magnitude()))
-    return np.array(errors)
 
 
 def positions_aligned(ours: np.ndarray, true: np.ndarray) -> tuple[np.ndarray, float]:
@@ -75,13 +65,13 @@ def test_fountain_against_its_survey(
     assert solved.unplaced == ()
     poses = true_poses(folder / "transforms.json")
     true = [poses[view.name] for view in solved.views]
-    ours = [np.linalg.inv(view.camera.camera_from_world) for view in solved.views]
+    ours = [view.camera.camera_from_world for view in solved.views]
     errors_deg = rotation_errors_deg(ours, true)
     assert errors_deg.mean() < mean_deg
     assert errors_deg.max() < worst_deg
 
-    true_positions = np.array([pose[:3, 3] for pose in true])
-    aligned, scale = positions_aligned(np.array([pose[:3, 3] for pose in ours]), true_positions)
+    true_positions = np.linalg.inv(true)[:, :3, 3]
+    aligned, scale = positions_aligned(np.linalg.inv(ours)[:, :3, 3], true_positions)
     low, high = np.percentile(solved.sparse_positions, [5, 95], axis=0)
     extent = scale * np.linalg.norm(high - low)
     position_errors = np.linalg.norm(aligned - true_positions, axis=1)
@@ -138,7 +128,7 @@ def test_three_dark_photographs_of_little_texture(
     assert solved.unplaced == ()
     poses = true_poses(folder / "transforms.json")
     true = [poses[view.name] for view in solved.views]
-    ours = [np.linalg.inv(view.camera.camera_from_world) for view in solved.views]
+    ours = [view.camera.camera_from_world for view in solved.views]
     assert rotation_errors_deg(ours, true).max() < 3
     assert num_confirming(solved.sparse_visibility).min() >= FEWEST_CONFIRMING
     assert unconfirmed(solved) is None

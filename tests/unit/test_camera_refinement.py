@@ -3,7 +3,6 @@
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
-from itertools import combinations
 from typing import Any
 
 import numpy as np
@@ -24,6 +23,7 @@ from backend.stages.camera_refinement import (
     with_refined,
 )
 from backend.stages.stereo_config import StereoConfig
+from tests.relative_rotations import rotation_errors_deg
 from tests.synthetic_scene import (
     DISTANCE,
     SIZE,
@@ -79,13 +79,8 @@ def measured(views: tuple[View, ...]) -> SurfacePoints:
 
 def rotation_error_deg(cameras: tuple[Camera, ...]) -> float:
     """The largest between two cameras, against the true ones."""
-    turns = [camera.camera_from_world[:3, :3] for camera in cameras]
-    true = [camera.camera_from_world[:3, :3] for camera in scene().cameras]
-    errors = (
-        Rotation.from_matrix(turns[i] @ turns[j].T @ true[j] @ true[i].T).magnitude()
-        for i, j in combinations(range(len(cameras)), 2)
-    )
-    return float(np.rad2deg(max(errors)))
+    poses = [camera.camera_from_world for camera in cameras]
+    return float(rotation_errors_deg(poses, [camera.camera_from_world for camera in scene().cameras]).max())
 
 
 def test_moved_cameras_come_back() -> None:

@@ -17,6 +17,7 @@ from backend.maths.silhouette import Silhouette, silhouette_or_none
 from backend.scene import Photo
 from backend.stages.features import picture_name
 from backend.stages.outline_cameras import held_against_outlines
+from tests.relative_rotations import rotation_errors_deg
 from tests.synthetic_scene import CENTRE, SIZE, Scene, arc_cameras, photographed, surface_points
 
 NUM_VIEWS = 5
@@ -55,14 +56,7 @@ def misplaced(views: PosedViews, seed: int = 0) -> PosedViews:
 
 def worst_rotation_deg(views: PosedViews, true: PosedViews) -> float:
     """Of the turn between two views."""
-    ours = Rotation.from_matrix(views.rotation)
-    wanted = Rotation.from_matrix(true.rotation)
-    between = [
-        ((ours[a] * ours[b].inv()) * (wanted[a] * wanted[b].inv()).inv()).magnitude()
-        for a in range(len(ours))
-        for b in range(a)
-    ]
-    return math.degrees(max(between))
+    return float(rotation_errors_deg(list(views.rotation), list(true.rotation)).max())
 
 
 def shared_features(views: PosedViews, count: int, mistaken: int = 0) -> Features:
@@ -102,6 +96,16 @@ def test_a_view_that_holds_the_axis_says_nothing(views: PosedViews, silhouettes:
     touched = tangencies(replace(views, rotation=rotation, translation=translation), silhouettes)
     assert not ((touched.view == 0) & (touched.other == 1)).any()
     assert ((touched.view == 0) & (touched.other == 2)).any()
+
+
+def test_two_views_from_one_place_say_nothing_of_each_other(
+    views: PosedViews, silhouettes: list[Silhouette]
+) -> None:
+    rotation, translation = views.rotation.copy(), views.translation.copy()
+    rotation[1], translation[1] = rotation[0], translation[0]
+    touched = tangencies(replace(views, rotation=rotation, translation=translation), silhouettes)
+    assert not ((touched.view < 2) & (touched.other < 2)).any()
+    assert np.isfinite(touched.beside_px).all()
 
 
 def test_changes_are_derivatives(views: PosedViews, silhouettes: list[Silhouette]) -> None:
