@@ -14,7 +14,8 @@ import pycolmap
 from jaxtyping import Float32, UInt8
 
 from ..images import fitted_size, read_image, resized
-from ..scene import Photo, Progress
+from ..scene import Photo, Progress, within
+from .tilted_features import DIRECTIONS, add_tilted_features, match_tilted_features
 
 _LENS_MODEL = "SIMPLE_RADIAL"
 """One focal length, the principal point and one distortion coefficient. With separate focal lengths and four
@@ -47,11 +48,18 @@ contrast would fill the places of fine features, which are the exact ones, with 
 _LARGEST_GAIN = 8.0
 
 _LEAST_CONTRAST = 0.02 / 3
-_LEAST_CONTRAST_SENSITIVE = 0.02 / 9
+_LEAST_CONTRAST_THOROUGH = 0.02 / 9
 """Of a feature, the difference of Gaussians of which the picture's range is 1. SIFT's own, and a third."""
 _LARGEST_RATIO = 0.8
-_LARGEST_RATIO_SENSITIVE = 0.9
 """Of a match's distance to that of its best rival (Lowe's test)."""
+
+_FINE_ASIDE_PIXELS = 3_000_000
+"""Up to so many in all, features of pictures as seen from aside are sought at twice the resolution as well:
+three to four times as many points that three photographs see, where those are 40 degrees apart."""
+_THOROUGH_BUDGET = 64_000
+"""Features of all pictures together, those seen from aside among them: each is compared with all others."""
+_FEWEST_ASIDE = 500
+"""Of each picture as seen from one side."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -153,10 +161,10 @@ def extract_features(
     groups: Sequence[LensGroup],
     num_features: int,
     *,
-    sensitive: bool,
+    thorough: bool = False,
     progress: Progress,
 ) -> None:
-    """Features of all pictures, at most num_features of each; the sensitive ones are fainter.
+    """Features of all pictures, at most num_features of each; thoroughly, fainter ones and those from aside.
 
     Finely, at twice the pictures' resolution, unless there are many pixels or plenty of features without.
     """
@@ -164,7 +172,7 @@ def extract_features(
     options.use_gpu = False
     options.num_threads = num_threads()
     options.sift.max_num_features = num_features
-    options.sift.peak_threshold = _LEAST_CONTRAST_SENSITIVE if sensitive else _LEAST_CONTRAST
+    options.sift.peak_threshold = _LEAST_CONTRAST_THOROUGH if thorough else _LEAST_CONTRAST
     num_pixels = sum(group.width * group.height * len(group.names) for group in groups)
     names = [name for group in groups for name in group.names]
 
@@ -174,7 +182,7 @@ def extract_features(
         )
 
     fine = num_pixels <= _FINE_PIXELS
-    if fine and not sensitive and num_pixels > _FEW_PIXELS:
+    if fine and not thorough and num_pixels > _FEW_PIXELS:
         progress(0.0, "Finding features")
         options.sift.first_octave = 0
         extract(names[:_PROBED])
@@ -184,10 +192,16 @@ def extract_features(
                 opened.clear_keypoints()
                 opened.clear_descriptors()
     options.sift.first_octave = -1 if fine else 0
+    finding = within(progress, 0.0, 0.5) if thorough else progress
     for start in range(0, len(names), options.num_threads):
-        progress(0.5 * start / len(names), "Finding features")
+        finding(start / len(names), "Finding features")
         # of those that have features already nothing is sought
         extract(names[start : start + options.num_threads])
+    if thorough:
+        options.sift.first_octave = -1 if num_pixels <= _FINE_ASIDE_PIXELS else 0
+        left = (_THOROUGH_BUDGET // len(names) - num_features) // DIRECTIONS
+        options.sift.max_num_features = max(_FEWEST_ASIDE, left)
+        add_tilted_features(database, folder, names, options, within(progress, 0.5, 1.0))
 
 
 def _fewest_features(database: Path, num_pictures: int) -> int:
@@ -197,7 +211,9 @@ def _fewest_features(database: Path, num_pictures: int) -> int:
         return min(opened.num_keypoints_for_image(image.image_id) for image in pictures)
 
 
-def match_pictures(database: Path, *, sensitive: bool, guided: bool, seed: int, again: bool = False) -> None:
+def match_pictures(
+    database: Path, *, thorough: bool = False, seed: int, again: bool = False, progress: Progress
+) -> None:
     """Matches between all pictures, and of them those that one motion of the camera explains.
 
     `again` keeps the matches that are there and only asks anew, by the seed's chance, what explains them.
@@ -206,14 +222,18 @@ def match_pictures(database: Path, *, sensitive: bool, guided: bool, seed: int, 
         if not again:
             opened.clear_matches()
         opened.clear_two_view_geometries()
-    matching = pycolmap.FeatureMatchingOptions()
-    matching.use_gpu = False
-    matching.guided_matching = guided
-    matching.sift.max_ratio = _LARGEST_RATIO_SENSITIVE if sensitive else _LARGEST_RATIO
-    # Guided matching holds a full table of distances per thread.
-    matching.num_threads = 1 if guided else num_threads()
+    progress(0.0, "Matching photographs")
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = seed
+    if thorough:
+        if not again:
+            match_tilted_features(database, _LARGEST_RATIO, progress)
+        pycolmap.geometric_verification(database, two_view_geometry_options=verification)
+        return
+    matching = pycolmap.FeatureMatchingOptions()
+    matching.use_gpu = False
+    matching.num_threads = num_threads()
+    matching.sift.max_ratio = _LARGEST_RATIO
     pycolmap.match_exhaustive(
         database,
         matching_options=matching,

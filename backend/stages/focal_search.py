@@ -25,18 +25,18 @@ core, and their worst camera is off by 1.7 degrees instead of 1.9."""
 
 
 def with_another_lens(
-    model: pycolmap.Reconstruction | None,
+    model: pycolmap.Reconstruction,
     database: Path,
     mapped: Callable[..., list[pycolmap.Reconstruction]],
-) -> pycolmap.Reconstruction | None:
+) -> pycolmap.Reconstruction:
     """The model, or one begun with another focal length, where that places more or confirms clearly more.
 
-    Of many photographs it has to do so with a few first. Where there is no model, or all focal lengths are
-    known, there is nothing to be tried. They are tried side by side, each with a database of its own.
+    Of many photographs it has to do so with a few first. Nothing is tried where all focal lengths are known.
+    They are tried side by side, each with a database of its own.
     """
     with pycolmap.Database.open(database) as opened:
         known = all(lens.has_prior_focal_length for lens in opened.read_all_cameras())
-    if model is None or known:
+    if known:
         return model
     few = _few_that_share_most(model)
     best_of_few = max(mapped(database, few), key=merit, default=None) if few else None
@@ -56,16 +56,16 @@ def with_another_lens(
 
 
 def without_contradicted_exif(
-    model: pycolmap.Reconstruction | None,
+    model: pycolmap.Reconstruction,
     database: Path,
     mapped: Callable[..., list[pycolmap.Reconstruction]],
-) -> pycolmap.Reconstruction | None:
+) -> pycolmap.Reconstruction:
     """The model, or one in which focal lengths from EXIF that it contradicts are as unknown.
 
     The other must not be clearly worse, and be confirmed: where there is little texture EXIF knows best.
     """
-    contradicted = set() if model is None else contradicted_lenses(model)
-    if model is None or not contradicted:
+    contradicted = contradicted_lenses(model)
+    if not contradicted:
         return model
     own = _copied(database, "without_exif")
     _forget_focal_lengths(own, contradicted)

@@ -18,11 +18,9 @@ class Attempt:
     pycolmap itself halves the first pair's two limits twice before it gives up.
     """
 
-    sensitive: bool
-    """With fainter features, and matches that are less unlike their rivals, for subjects with little texture.
-    An unknown focal length is held meanwhile: so few matches drag it anywhere."""
-    guided: bool
-    """Matches again along the epipolar lines: more of them, less exact, and slow."""
+    thorough: bool
+    """With fainter features and those of pictures as seen from aside: for photographs that are far apart, and
+    subjects with little texture."""
     initial_angle_deg: float
     initial_inliers: int
     further_inliers: int
@@ -51,13 +49,13 @@ def mapped_models(
     options.mapper.init_min_tri_angle = attempt.initial_angle_deg
     options.mapper.init_min_num_inliers = attempt.initial_inliers
     options.mapper.abs_pose_min_num_inliers = attempt.further_inliers
+    # What shares features with one placed photograph alone has no distance, but would be placed at one.
+    options.structure_less_registration_fallback = False
     with pycolmap.Database.open(database) as opened:
         lenses = opened.read_all_cameras()
     # A focal length from EXIF is better than what two photographs can tell; refine_lenses weighs the two.
-    held = {lens.camera_id for lens in lenses if lens.has_prior_focal_length or attempt.sensitive}
+    held = {lens.camera_id for lens in lenses if lens.has_prior_focal_length}
     options.constant_cameras = options.mapper.constant_cameras = held
-    if attempt.sensitive:
-        options.mapper.abs_pose_refine_focal_length = options.mapper.abs_pose_refine_extra_params = False
     models = pycolmap.incremental_mapping(
         database,
         folder,

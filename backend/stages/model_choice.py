@@ -1,13 +1,14 @@
 """The best model of several attempts, each less strict than the one before."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
 import PIL.Image  # noqa: F401 - pycolmap loaded before Pillow corrupts memory when Pillow next saves
 import pycolmap
 
-from ..scene import Decision, Progress
+from ..scene import Decision, Progress, within
 from .confirmation import FEWEST_CONFIRMING
 from .features import LensGroup, extract_features, match_pictures, register_pictures
 from .focal_search import FEW_PHOTOS, with_another_lens, without_contradicted_exif
@@ -15,21 +16,31 @@ from .mapping import Attempt, mapped_models
 from .model_merit import fewest_confirming, merit
 
 _ATTEMPTS = (
-    Attempt(sensitive=False, guided=False, initial_angle_deg=16.0, initial_inliers=100, further_inliers=30),
-    Attempt(sensitive=False, guided=False, initial_angle_deg=6.0, initial_inliers=40, further_inliers=20),
-    Attempt(sensitive=True, guided=False, initial_angle_deg=16.0, initial_inliers=100, further_inliers=30),
-    Attempt(sensitive=True, guided=False, initial_angle_deg=6.0, initial_inliers=40, further_inliers=20),
-    Attempt(sensitive=True, guided=True, initial_angle_deg=16.0, initial_inliers=100, further_inliers=30),
-    Attempt(sensitive=True, guided=True, initial_angle_deg=6.0, initial_inliers=40, further_inliers=15),
+    Attempt(thorough=False, initial_angle_deg=16.0, initial_inliers=100, further_inliers=30),
+    Attempt(thorough=False, initial_angle_deg=6.0, initial_inliers=40, further_inliers=20),
+    Attempt(thorough=True, initial_angle_deg=16.0, initial_inliers=100, further_inliers=30),
+    Attempt(thorough=True, initial_angle_deg=6.0, initial_inliers=40, further_inliers=20),
 )
-"""Tried in this order until all photographs are placed and confirmed, the guided ones until enough are."""
+"""Tried in this order until all photographs are placed and confirmed."""
 
 _DRAWS = 4
-"""Of chance, for each sensitive attempt. The walnut's three photographs come out right or 55 degrees wrong by
-what the first pair happens to agree on, but then with a quarter of the points that three confirm."""
+"""Of chance, for each thorough attempt. Three photographs of little texture come out right or 50 degrees
+wrong by what the first pair happens to agree on, but then with a quarter of the points that three confirm."""
 
-_ENOUGH_SHARE = 0.75
-"""Of the photographs. Guided matching takes longer than all the rest, too long for a last photograph."""
+_EXTRACTED, _STEP = 0.4, 0.15
+"""Of the progress: up to where the usual features are found, and what an attempt takes."""
+
+_Matched = tuple[bool, int]
+"""Whether thoroughly, and which draw of chance."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Found:
+    """A model, and what it was made of."""
+
+    model: pycolmap.Reconstruction
+    database: Path
+    thorough: bool
 
 
 def best_model(
@@ -43,87 +54,79 @@ def best_model(
 ) -> tuple[pycolmap.Reconstruction | None, Path, tuple[Decision, ...]]:
     """The best model of all attempts, None where there is none at all, and the database of its features.
 
-    With them the decision about features, where fainter ones were tried.
+    With them the decision about features, where others than the usual ones were tried.
     """
     num_photos = sum(len(group.names) for group in groups)
-    best: pycolmap.Reconstruction | None = None
-    best_of_usual: pycolmap.Reconstruction | None = None
-    best_database = database = workdir / "features.db"
-    extracted: bool | None = None
-    matched: tuple[bool, bool, int] | None = None
+    best: _Found | None = None
+    usual: _Found | None = None
+    database = workdir
+    matched: _Matched | None = None
     for number, attempt in enumerate(_ATTEMPTS):
-        if _is_enough(best, attempt, num_photos):
+        if _is_enough(best, num_photos):
             break
-        share = 0.5 + 0.08 * number
-        if attempt.sensitive != extracted:
-            database = workdir / ("sensitive.db" if attempt.sensitive else "features.db")
-            on_feature = partial(_within, progress, share, share + 0.08) if attempt.sensitive else progress
+        thorough, start = attempt.thorough, _EXTRACTED + number * _STEP
+        if matched is None or thorough != matched[0]:
+            usual = best
+            database = workdir / ("thorough.db" if thorough else "features.db")
             database.unlink(missing_ok=True)
             register_pictures(database, folder, groups)
-            extract_features(
-                database, folder, groups, num_features, sensitive=attempt.sensitive, progress=on_feature
-            )
-            extracted = attempt.sensitive
-        on_photo = partial(progress, share + 0.06, "Placing cameras")
-        for draw in range(_DRAWS if attempt.sensitive and not attempt.guided else 1):
-            wanted = attempt.sensitive, attempt.guided, draw
-            if wanted != matched:
-                progress(share + 0.04, "Matching photographs")
-                match_pictures(
-                    database,
-                    sensitive=attempt.sensitive,
-                    guided=attempt.guided,
-                    again=matched is not None and matched[:2] == wanted[:2],
-                    seed=seed + draw,
-                )
-                matched = wanted
+            extracting = within(progress, start if number else 0.0, start + 0.5 * _STEP)
+            extract_features(database, folder, groups, num_features, thorough=thorough, progress=extracting)
+        on_match = within(progress, start + 0.5 * _STEP, start + 0.75 * _STEP)
+        on_photo = partial(progress, start + 0.75 * _STEP, "Placing cameras")
+        for draw in range(_DRAWS if thorough else 1):
+            matched = _match(database, (thorough, draw), matched, seed + draw, on_match)
             mapped = partial(mapped_models, folder, attempt, seed + draw, on_photo)
             model = max(mapped(database), key=merit, default=None)
-            if model is not None and (best is None or merit(model) > merit(best)):
-                best, best_database = model, database
-            if num_photos > FEW_PHOTOS and _is_enough(best, attempt, num_photos):
+            if model is not None and (best is None or merit(model) > merit(best.model)):
+                best = _Found(model=model, database=database, thorough=thorough)
+            if num_photos > FEW_PHOTOS and _is_enough(best, num_photos):
                 break
-        if not attempt.sensitive:
-            best = with_another_lens(best, database, mapped)
-            best = without_contradicted_exif(best, database, mapped)
-            best_of_usual = best
-    if best is None or not extracted:
-        return best, database, ()
-    return best, best_database, (_why_fainter(best_of_usual, best, num_photos),)
+        if best is not None:
+            other = with_another_lens(best.model, database, mapped)
+            other = without_contradicted_exif(other, database, mapped)
+            if other is not best.model:
+                best = _Found(model=other, database=database, thorough=thorough)
+    if best is None or matched is None:
+        return None, database, ()
+    return best.model, best.database, (_why_thorough(usual, best, num_photos),) if matched[0] else ()
 
 
-def _is_enough(model: pycolmap.Reconstruction | None, attempt: Attempt, num_photos: int) -> bool:
-    """Whether the attempt is not needed any more."""
-    if model is None:
+def _match(
+    database: Path, wanted: _Matched, matched: _Matched | None, seed: int, progress: Progress
+) -> _Matched:
+    """What is matched in the database now: what was wanted, at once where it was that already."""
+    thorough, _ = wanted
+    if wanted != matched:
+        again = matched is not None and matched[0] == thorough
+        match_pictures(database, thorough=thorough, again=again, seed=seed, progress=progress)
+    return wanted
+
+
+def _is_enough(best: _Found | None, num_photos: int) -> bool:
+    """Whether no further attempt is needed."""
+    if best is None or best.model.num_reg_images() < num_photos:
         return False
-    num_placed = model.num_reg_images()
-    if attempt.guided and num_placed >= _ENOUGH_SHARE * num_photos:
-        return True
-    confirmed = num_photos < 3 or fewest_confirming(model) >= FEWEST_CONFIRMING
-    return num_placed == num_photos and confirmed
+    return num_photos < 3 or fewest_confirming(best.model) >= FEWEST_CONFIRMING
 
 
-def _why_fainter(
-    usual: pycolmap.Reconstruction | None, best: pycolmap.Reconstruction, num_photos: int
-) -> Decision:
+def _why_thorough(usual: _Found | None, best: _Found, num_photos: int) -> Decision:
     before = f"with the usual ones {_how_sure(usual, num_photos)}"
-    if best is usual:
-        return Decision(
-            what="features", choice="the usual ones", because=f"{before}; fainter ones gave no more"
-        )
-    after = f"with fainter ones {_how_sure(best, num_photos)}"
-    return Decision(what="features", choice="fainter ones", because=f"{before}, {after}")
-
-
-def _how_sure(model: pycolmap.Reconstruction | None, num_photos: int) -> str:
-    if model is None:
-        return "no photographs could be placed"
-    confirming = fewest_confirming(model)
-    return (
-        f"{model.num_reg_images()} of {num_photos} photographs were placed and the least sure of them "
-        f"confirmed by {confirming} points that three see"
+    if not best.thorough:
+        because = f"{before}; fainter ones and those of pictures as seen from aside gave no more"
+        return Decision(what="features", choice="the usual ones", because=because)
+    return Decision(
+        what="features",
+        choice="fainter ones as well, and those of pictures as seen from aside",
+        because=f"{before}, with these {_how_sure(best, num_photos)}",
     )
 
 
-def _within(progress: Progress, start: float, end: float, share: float, text: str) -> None:
-    progress(start + (end - start) * share, text)
+def _how_sure(found: _Found | None, num_photos: int) -> str:
+    if found is None:
+        return "no photographs could be placed"
+    confirming = fewest_confirming(found.model)
+    return (
+        f"{found.model.num_reg_images()} of {num_photos} photographs were placed and the least sure of them "
+        f"confirmed by {confirming} points that three see"
+    )

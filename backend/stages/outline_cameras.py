@@ -20,12 +20,15 @@ from ..maths.pieces import connected_pieces
 from ..maths.posed_views import PosedViews
 from ..maths.silhouette import silhouettes_or_none
 from ..scene import Decision, Photo
-from .confirmation import ADJUSTED, FEWEST_CONFIRMING, HELD_AGAINST_OUTLINES
+from .confirmation import ADJUSTED, HELD_AGAINST_OUTLINES
 from .features import picture_index
 from .lens_refinement import focal_sigma
 from .lenses import rigid_matrix
 from .model_merit import fewest_confirming
 
+_WELL_CONFIRMED = 100
+"""Points that three photographs see, of the photograph with the fewest: with fifty, cameras of what is plain
+were still up to two degrees off."""
 _LEAST_MISS_PX = 0.3
 """By which outlines miss each other for cameras to be moved: as much do masks that are off by a pixel."""
 _LARGEST_SHARE_LEFT = 0.5
@@ -41,11 +44,11 @@ def held_against_outlines(
 ) -> tuple[pycolmap.Reconstruction, tuple[Decision, ...]]:
     """The model, or one whose cameras suit the outlines, and what decided it.
 
-    Only where points that three photographs see do not confirm the cameras, and each photograph that was
+    Only where points that three photographs see do not confirm the cameras well, and each photograph that was
     placed has a mask that shows the subject whole. Distortion is taken to be none then, for nothing tells it.
     """
     ids = sorted(model.reg_image_ids())
-    if fewest_confirming(model) >= FEWEST_CONFIRMING:
+    if fewest_confirming(model) >= _WELL_CONFIRMED:
         return model, ()
     images = [model.images[image_id] for image_id in ids]
     lenses = [model.cameras[image.camera_id] for image in images]

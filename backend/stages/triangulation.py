@@ -52,8 +52,8 @@ def triangulate(
         for i, c in enumerate(cameras)
     ]
     register_pictures(database, folder, groups)
-    extract_features(database, folder, groups, _NUM_FEATURES, sensitive=False, progress=progress)
-    match_pictures(database, sensitive=False, guided=False, seed=seed)
+    extract_features(database, folder, groups, _NUM_FEATURES, progress=within(progress, 0.0, 0.5))
+    match_pictures(database, seed=seed, progress=within(progress, 0.5, 1.0))
     return _points_of_pairs(database, cameras, largest_error_px)
 
 

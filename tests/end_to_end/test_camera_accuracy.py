@@ -134,5 +134,6 @@ def test_three_dark_photographs_of_little_texture(
     assert unconfirmed(solved) is None
     told = solved.decisions[0]
     if not other_lenses:
-        assert (told.what, told.choice) == ("features", "fainter ones")
+        fainter = "fainter ones as well, and those of pictures as seen from aside"
+        assert (told.what, told.choice) == ("features", fainter)
         assert told.because.startswith("with the usual ones 3 of 3 photographs were placed")

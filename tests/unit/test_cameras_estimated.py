@@ -21,8 +21,10 @@ from backend.scene import Decision, Photo, SolvedCameras, Unplaced, no_progress
 from backend.stages import features, focal_search, model_choice, model_merit
 from backend.stages.camera_report import build_camera_report, camera_report_html, camera_report_numbers
 from backend.stages.cameras import CamerasConfig, solve_cameras
+from backend.stages.confirmation import num_confirming
 from backend.stages.lens_refinement import Gaussian, joined, refine_lenses
 from backend.stages.region import RegionConfig, find_region
+from tests.relative_rotations import rotation_errors_deg
 from tests.ridge_photos import FOCAL_PX, HEIGHT, WIDTH, arc_pose, look_at_origin, make_photo, render
 
 CONFIG = CamerasConfig(max_features=1200)
@@ -83,6 +85,19 @@ def test_cameras_of_rendered_photographs(focal_px: float | None, corner: list[Ph
         cosine = ours[:3, 3] @ true[:3, 3] / np.linalg.norm(ours[:3, 3]) / np.linalg.norm(true[:3, 3])
         assert cosine > math.cos(math.radians(1.0))
         assert view.camera.fx_px == pytest.approx(FOCAL_PX, rel=0.02)
+
+
+def test_photographs_far_apart_are_placed_by_features_as_seen_from_aside(tmp_path: Path) -> None:
+    """The usual ones place two of three photographs that are 40 degrees apart."""
+    poses = {f"{i}.png": arc_pose(angle) for i, angle in enumerate([-40.0, 0.0, 40.0])}
+    solved = solve([make_photo(name, render(pose, 0.3)) for name, pose in poses.items()], tmp_path)
+    assert not solved.unplaced
+    told = next(decision for decision in solved.decisions if decision.what == "features")
+    assert told.choice == "fainter ones as well, and those of pictures as seen from aside"
+    assert told.because.startswith("with the usual ones 2 of 3 photographs were placed")
+    assert num_confirming(solved.sparse_visibility).min() > 100
+    turns = [view.camera.camera_from_world for view in solved.views]
+    assert rotation_errors_deg(turns, list(poses.values())).max() < 0.4
 
 
 def check_evidence(solved: SolvedCameras) -> None:
@@ -258,8 +273,8 @@ def test_chance_is_drawn_again_for_few_photographs_and_else_until_all_are_confir
 ) -> None:
     drawn: list[int] = []
 
-    def match(_: Path, *, sensitive: bool, seed: int, **__: bool) -> None:
-        if sensitive:
+    def match(_: Path, *, thorough: bool, seed: int, **__: object) -> None:
+        if thorough:
             drawn.append(seed)
 
     def nothing(*_: Any, **__: Any) -> None:
@@ -271,8 +286,9 @@ def test_chance_is_drawn_again_for_few_photographs_and_else_until_all_are_confir
         "match_pictures": match,
         "mapped_models": lambda *_: [pycolmap.Reconstruction()],
         "with_another_lens": lambda model, *_: model,
+        "without_contradicted_exif": lambda model, *_: model,
         "_is_enough": lambda *_: bool(drawn),
-        "_why_fainter": lambda *_: Decision(what="features", choice="fainter ones", because="there are more"),
+        "_why_thorough": lambda *_: Decision(what="features", choice="the usual ones", because="it is so"),
     }
     for name, fake in fakes.items():
         monkeypatch.setattr(model_choice, name, fake)
@@ -296,7 +312,7 @@ def test_of_large_photographs_features_are_sought_finely_where_there_are_few(
         monkeypatch.setattr(features, "_FEW_PIXELS", few_pixels)
         monkeypatch.setattr(features, "_FINE_PIXELS", fine_pixels)
         features.register_pictures(database, tmp_path, [group])
-        features.extract_features(database, tmp_path, [group], 5000, sensitive=False, progress=no_progress)
+        features.extract_features(database, tmp_path, [group], 5000, progress=no_progress)
         with pycolmap.Database.open(database) as opened:
             return [opened.num_keypoints_for_image(image.image_id) for image in opened.read_all_images()]
 
