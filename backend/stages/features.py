@@ -58,8 +58,8 @@ _FINE_ASIDE_PIXELS = 3_000_000
 three to four times as many points that three photographs see, where those are 40 degrees apart."""
 _THOROUGH_BUDGET = 64_000
 """Features of all pictures together, those seen from aside among them: each is compared with all others."""
-_FEWEST_ASIDE = 500
-"""Of each picture as seen from one side."""
+_ASIDE_SHARE = 2 / 3
+"""Of them, those seen from aside."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -161,47 +161,84 @@ def extract_features(
     groups: Sequence[LensGroup],
     num_features: int,
     *,
-    thorough: bool = False,
     progress: Progress,
 ) -> None:
-    """Features of all pictures, at most num_features of each; thoroughly, fainter ones and those from aside.
+    """Features of all pictures, at most num_features of each.
 
     Finely, at twice the pictures' resolution, unless there are many pixels or plenty of features without.
     """
-    options = pycolmap.FeatureExtractionOptions()
-    options.use_gpu = False
-    options.num_threads = num_threads()
-    options.sift.max_num_features = num_features
-    options.sift.peak_threshold = _LEAST_CONTRAST_THOROUGH if thorough else _LEAST_CONTRAST
-    num_pixels = sum(group.width * group.height * len(group.names) for group in groups)
-    names = [name for group in groups for name in group.names]
-
-    def extract(names: Sequence[str]) -> None:
-        pycolmap.extract_features(
-            database, folder, image_names=names, extraction_options=options, device=pycolmap.Device.cpu
-        )
-
+    num_pixels, names = _pixels_and_names(groups)
+    options = _extraction_options(num_features, _LEAST_CONTRAST)
     fine = num_pixels <= _FINE_PIXELS
-    if fine and not thorough and num_pixels > _FEW_PIXELS:
+    if fine and num_pixels > _FEW_PIXELS:
         progress(0.0, "Finding features")
         options.sift.first_octave = 0
-        extract(names[:_PROBED])
+        _extract(database, folder, names[:_PROBED], options)
         fine = _fewest_features(database, _PROBED) < _PLENTY
         if fine:
             with pycolmap.Database.open(database) as opened:
                 opened.clear_keypoints()
                 opened.clear_descriptors()
     options.sift.first_octave = -1 if fine else 0
-    finding = within(progress, 0.0, 0.5) if thorough else progress
+    _extract_in_turn(database, folder, names, options, progress)
+
+
+def extract_thoroughly(
+    database: Path,
+    folder: Path,
+    groups: Sequence[LensGroup],
+    num_features: int,
+    *,
+    progress: Progress,
+) -> None:
+    """Fainter features as well, and those of the pictures as seen from aside."""
+    num_pixels, names = _pixels_and_names(groups)
+    budget = _THOROUGH_BUDGET / len(names)
+    upright = min(num_features, round((1 - _ASIDE_SHARE) * budget))
+    options = _extraction_options(upright, _LEAST_CONTRAST_THOROUGH)
+    options.sift.first_octave = -1 if num_pixels <= _FINE_PIXELS else 0
+    _extract_in_turn(database, folder, names, options, within(progress, 0.0, 0.5))
+    aside = min(num_features, round(_ASIDE_SHARE * budget / DIRECTIONS))
+    options = _extraction_options(aside, _LEAST_CONTRAST_THOROUGH)
+    options.sift.first_octave = -1 if num_pixels <= _FINE_ASIDE_PIXELS else 0
+    add_tilted_features(database, folder, names, options, within(progress, 0.5, 1.0))
+
+
+def _pixels_and_names(groups: Sequence[LensGroup]) -> tuple[int, list[str]]:
+    """Of all pictures, how many pixels together, and their names."""
+    num_pixels = sum(group.width * group.height * len(group.names) for group in groups)
+    return num_pixels, [name for group in groups for name in group.names]
+
+
+def _extraction_options(num_features: int, least_contrast: float) -> pycolmap.FeatureExtractionOptions:
+    options = pycolmap.FeatureExtractionOptions()
+    options.use_gpu = False
+    options.num_threads = num_threads()
+    options.sift.max_num_features = num_features
+    options.sift.peak_threshold = least_contrast
+    return options
+
+
+def _extract_in_turn(
+    database: Path,
+    folder: Path,
+    names: Sequence[str],
+    options: pycolmap.FeatureExtractionOptions,
+    progress: Progress,
+) -> None:
+    """A few pictures at a time, so that it shows and can be cancelled."""
     for start in range(0, len(names), options.num_threads):
-        finding(start / len(names), "Finding features")
+        progress(start / len(names), "Finding features")
         # of those that have features already nothing is sought
-        extract(names[start : start + options.num_threads])
-    if thorough:
-        options.sift.first_octave = -1 if num_pixels <= _FINE_ASIDE_PIXELS else 0
-        left = (_THOROUGH_BUDGET // len(names) - num_features) // DIRECTIONS
-        options.sift.max_num_features = max(_FEWEST_ASIDE, left)
-        add_tilted_features(database, folder, names, options, within(progress, 0.5, 1.0))
+        _extract(database, folder, names[start : start + options.num_threads], options)
+
+
+def _extract(
+    database: Path, folder: Path, names: Sequence[str], options: pycolmap.FeatureExtractionOptions
+) -> None:
+    pycolmap.extract_features(
+        database, folder, image_names=list(names), extraction_options=options, device=pycolmap.Device.cpu
+    )
 
 
 def _fewest_features(database: Path, num_pictures: int) -> int:
@@ -211,25 +248,12 @@ def _fewest_features(database: Path, num_pictures: int) -> int:
         return min(opened.num_keypoints_for_image(image.image_id) for image in pictures)
 
 
-def match_pictures(
-    database: Path, *, thorough: bool = False, seed: int, again: bool = False, progress: Progress
-) -> None:
-    """Matches between all pictures, and of them those that one motion of the camera explains.
-
-    `again` keeps the matches that are there and only asks anew, by the seed's chance, what explains them.
-    """
+def match_pictures(database: Path, *, seed: int, progress: Progress) -> None:
+    """Matches between all pictures, and of them those that one motion of the camera explains."""
     with pycolmap.Database.open(database) as opened:
-        if not again:
-            opened.clear_matches()
+        opened.clear_matches()
         opened.clear_two_view_geometries()
     progress(0.0, "Matching photographs")
-    verification = pycolmap.TwoViewGeometryOptions()
-    verification.ransac.random_seed = seed
-    if thorough:
-        if not again:
-            match_tilted_features(database, _LARGEST_RATIO, progress)
-        pycolmap.geometric_verification(database, two_view_geometry_options=verification)
-        return
     matching = pycolmap.FeatureMatchingOptions()
     matching.use_gpu = False
     matching.num_threads = num_threads()
@@ -237,6 +261,25 @@ def match_pictures(
     pycolmap.match_exhaustive(
         database,
         matching_options=matching,
-        verification_options=verification,
+        verification_options=_verification_options(seed),
         device=pycolmap.Device.cpu,
     )
+
+
+def match_thoroughly(database: Path, *, seed: int, again: bool, progress: Progress) -> None:
+    """The same of features that were sought thoroughly, of which several may be at one place.
+
+    `again` keeps the matches that are there and only asks anew, by the seed's chance, what explains them.
+    """
+    with pycolmap.Database.open(database) as opened:
+        opened.clear_two_view_geometries()
+    progress(0.0, "Matching photographs")
+    if not again:
+        match_tilted_features(database, _LARGEST_RATIO, progress)
+    pycolmap.geometric_verification(database, two_view_geometry_options=_verification_options(seed))
+
+
+def _verification_options(seed: int) -> pycolmap.TwoViewGeometryOptions:
+    options = pycolmap.TwoViewGeometryOptions()
+    options.ransac.random_seed = seed
+    return options

@@ -10,7 +10,14 @@ import pycolmap
 
 from ..scene import Decision, Progress, within
 from .confirmation import FEWEST_CONFIRMING
-from .features import LensGroup, extract_features, match_pictures, register_pictures
+from .features import (
+    LensGroup,
+    extract_features,
+    extract_thoroughly,
+    match_pictures,
+    match_thoroughly,
+    register_pictures,
+)
 from .focal_search import FEW_PHOTOS, with_another_lens, without_contradicted_exif
 from .mapping import Attempt, mapped_models
 from .model_merit import fewest_confirming, merit
@@ -71,7 +78,8 @@ def best_model(
             database.unlink(missing_ok=True)
             register_pictures(database, folder, groups)
             extracting = within(progress, start if number else 0.0, start + 0.5 * _STEP)
-            extract_features(database, folder, groups, num_features, thorough=thorough, progress=extracting)
+            extract = extract_thoroughly if thorough else extract_features
+            extract(database, folder, groups, num_features, progress=extracting)
         on_match = within(progress, start + 0.5 * _STEP, start + 0.75 * _STEP)
         on_photo = partial(progress, start + 0.75 * _STEP, "Placing cameras")
         for draw in range(_DRAWS if thorough else 1):
@@ -97,9 +105,13 @@ def _match(
 ) -> _Matched:
     """What is matched in the database now: what was wanted, at once where it was that already."""
     thorough, _ = wanted
-    if wanted != matched:
-        again = matched is not None and matched[0] == thorough
-        match_pictures(database, thorough=thorough, again=again, seed=seed, progress=progress)
+    if wanted == matched:
+        return matched
+    if thorough:
+        again = matched is not None and matched[0]
+        match_thoroughly(database, seed=seed, again=again, progress=progress)
+    else:
+        match_pictures(database, seed=seed, progress=progress)
     return wanted
 
 

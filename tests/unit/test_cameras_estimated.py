@@ -87,6 +87,7 @@ def test_cameras_of_rendered_photographs(focal_px: float | None, corner: list[Ph
         assert view.camera.fx_px == pytest.approx(FOCAL_PX, rel=0.02)
 
 
+@pytest.mark.slow
 def test_photographs_far_apart_are_placed_by_features_as_seen_from_aside(tmp_path: Path) -> None:
     """The usual ones place two of three photographs that are 40 degrees apart."""
     poses = {f"{i}.png": arc_pose(angle) for i, angle in enumerate([-40.0, 0.0, 40.0])}
@@ -273,9 +274,8 @@ def test_chance_is_drawn_again_for_few_photographs_and_else_until_all_are_confir
 ) -> None:
     drawn: list[int] = []
 
-    def match(_: Path, *, thorough: bool, seed: int, **__: object) -> None:
-        if thorough:
-            drawn.append(seed)
+    def match(_: Path, *, seed: int, **__: object) -> None:
+        drawn.append(seed)
 
     def nothing(*_: Any, **__: Any) -> None:
         pass
@@ -283,7 +283,9 @@ def test_chance_is_drawn_again_for_few_photographs_and_else_until_all_are_confir
     fakes = {
         "register_pictures": nothing,
         "extract_features": nothing,
-        "match_pictures": match,
+        "extract_thoroughly": nothing,
+        "match_pictures": nothing,
+        "match_thoroughly": match,
         "mapped_models": lambda *_: [pycolmap.Reconstruction()],
         "with_another_lens": lambda model, *_: model,
         "without_contradicted_exif": lambda model, *_: model,

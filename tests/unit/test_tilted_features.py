@@ -57,12 +57,14 @@ def extracted(tmp_path_factory: pytest.TempPathFactory) -> dict[bool, Path]:
     group = LensGroup(names=NAMES, width=WIDTH, height=HEIGHT, focal_px=None)
     found = {}
     for thorough in (False, True):
-        found[thorough] = folder / f"{thorough}.db"
-        features.register_pictures(found[thorough], folder, [group])
-        features.extract_features(
-            found[thorough], folder, [group], 3000, thorough=thorough, progress=no_progress
-        )
-        features.match_pictures(found[thorough], thorough=thorough, seed=0, progress=no_progress)
+        database = found[thorough] = folder / f"{thorough}.db"
+        features.register_pictures(database, folder, [group])
+        if thorough:
+            features.extract_thoroughly(database, folder, [group], 3000, progress=no_progress)
+            features.match_thoroughly(database, seed=0, again=False, progress=no_progress)
+        else:
+            features.extract_features(database, folder, [group], 3000, progress=no_progress)
+            features.match_pictures(database, seed=0, progress=no_progress)
     return found
 
 
