@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float64
 
 from ..images import fitted_size, resized
 from ..maths.lines import nearest_along
-from ..scene import Camera, Progress, View
+from ..scene import Camera, Progress, View, within
 from .features import (
     LensGroup,
     brightness,
