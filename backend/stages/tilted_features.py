@@ -5,7 +5,7 @@ same. So each picture is also shown narrowed along several directions, and what 
 picture: a simulated tilt (Morel and Yu, "ASIFT", 2009).
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
@@ -29,12 +29,16 @@ _BORDER_SCALES = 6.0
 """Features nearer than so many of their scales to the border may be of the border."""
 
 
+_Features = tuple[Float32[np.ndarray, "features numbers"], Descriptors]
+"""Keypoints, of which the first two numbers are the place in pixels, and descriptors."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class _Tilted:
     """A picture as seen from aside; pixel (0, 0) has its middle at (0.5, 0.5)."""
 
     name: str
-    of: str
+    picture_size_px: tuple[int, int]
     picture_from_tilted: Float64[np.ndarray, "2 3"]
 
 
@@ -54,11 +58,11 @@ def add_tilted_features(
     database_aside = aside / "features.db"
     database_aside.unlink(missing_ok=True)
     pycolmap.Database.open(database_aside).close()
-    tilted: list[_Tilted] = []
+    tilted: dict[str, list[_Tilted]] = {}
     for number, name in enumerate(names):
         progress(number / len(names), "Finding features from aside")
-        of_this = _write_tilted(folder, name, aside)
-        files = [one.name for one in of_this]
+        tilted[name] = _write_tilted(folder, name, aside)
+        files = [one.name for one in tilted[name]]
         pycolmap.import_images(
             database_aside, aside, camera_mode=pycolmap.CameraMode.PER_IMAGE, image_names=files
         )
@@ -69,8 +73,7 @@ def add_tilted_features(
             extraction_options=options,
             device=pycolmap.Device.cpu,
         )
-        tilted += of_this
-    _merge(database, database_aside, folder, tilted)
+    _merge(database, database_aside, tilted)
 
 
 def match_tilted_features(database: Path, largest_ratio: float, progress: Progress) -> None:
@@ -123,28 +126,26 @@ def _write_tilted(folder: Path, name: str, aside: Path) -> list[_Tilted]:
         seen, picture_from_tilted = narrowed(picture, np.pi * number / DIRECTIONS)
         file = f"{Path(name).stem}_{number}.png"
         seen.save(aside / file, compress_level=1)
-        written.append(_Tilted(name=file, of=name, picture_from_tilted=picture_from_tilted))
+        written.append(
+            _Tilted(name=file, picture_size_px=picture.size, picture_from_tilted=picture_from_tilted)
+        )
     return written
 
 
-def _merge(database: Path, database_aside: Path, folder: Path, tilted: Sequence[_Tilted]) -> None:
-    with pycolmap.Database.open(database_aside) as opened:
-        ids = {image.name: image.image_id for image in opened.read_all_images()}
-        found = {one.name: _read_features(opened, ids[one.name]) for one in tilted}
+def _merge(database: Path, database_aside: Path, tilted: Mapping[str, Sequence[_Tilted]]) -> None:
+    """Add what was found in tilted pictures to what was found in those of these names."""
+    usual, found = _read_all(database), _read_all(database_aside)
     with pycolmap.Database.open(database) as opened:
-        ids = {image.name: image.image_id for image in opened.read_all_images()}
-        usual = {name: _read_features(opened, ids[name]) for name in {one.of for one in tilted}}
+        ids = _image_ids(opened)
         opened.clear_keypoints()
         opened.clear_descriptors()
-        for name, (keypoints, described) in usual.items():
-            with PIL.Image.open(folder / name) as picture:
-                size = np.array(picture.size, np.float64)
+        for name, from_aside in tilted.items():
+            keypoints, described = usual[name]
             places, descriptors = [keypoints[:, :2]], [described]
-            for one in tilted:
-                if one.of == name:
-                    inside = _inside(*found[one.name], one.picture_from_tilted, size)
-                    places.append(inside[0])
-                    descriptors.append(inside[1])
+            for one in from_aside:
+                inside = _inside(*found[one.name], one)
+                places.append(inside[0])
+                descriptors.append(inside[1])
             opened.write_keypoints(ids[name], _at_first_of_place(np.concatenate(places)))
             written = pycolmap.FeatureDescriptors()
             written.type = pycolmap.FeatureExtractorType.SIFT
@@ -152,10 +153,17 @@ def _merge(database: Path, database_aside: Path, folder: Path, tilted: Sequence[
             opened.write_descriptors(ids[name], written)
 
 
-def _read_features(
-    opened: pycolmap.Database, image_id: int
-) -> tuple[Float32[np.ndarray, "features numbers"], Descriptors]:
-    """Keypoints, of which the first two numbers are the place in pixels, and descriptors."""
+def _read_all(database: Path) -> dict[str, _Features]:
+    """Features of each picture, by its name."""
+    with pycolmap.Database.open(database) as opened:
+        return {name: _read_features(opened, image_id) for name, image_id in _image_ids(opened).items()}
+
+
+def _image_ids(opened: pycolmap.Database) -> dict[str, int]:
+    return {image.name: image.image_id for image in opened.read_all_images()}
+
+
+def _read_features(opened: pycolmap.Database, image_id: int) -> _Features:
     keypoints: Float32[np.ndarray, "features numbers"] = np.asarray(opened.read_keypoints(image_id))
     return keypoints, opened.read_descriptors(image_id).data
 
@@ -163,14 +171,14 @@ def _read_features(
 def _inside(
     keypoints: Float32[np.ndarray, "features 6"],
     descriptors: Descriptors,
-    picture_from_tilted: Float64[np.ndarray, "2 3"],
-    size_px: Float64[np.ndarray, "2"],
+    tilted: _Tilted,
 ) -> tuple[Float32[np.ndarray, "inside 2"], UInt8[np.ndarray, "inside bytes"]]:
     """Places in the picture of those that do not see its border, and their descriptors."""
+    picture_from_tilted = tilted.picture_from_tilted
     places = keypoints[:, :2] @ picture_from_tilted[:, :2].T + picture_from_tilted[:, 2]
     shape = keypoints[:, 2:].reshape(-1, 2, 2)
     margin = _BORDER_SCALES * np.sqrt(np.abs(np.linalg.det(shape)))[:, None]
-    inside = ((places > margin) & (places < size_px - margin)).all(axis=1)
+    inside = ((places > margin) & (places < np.array(tilted.picture_size_px) - margin)).all(axis=1)
     return places[inside].astype(np.float32), descriptors[inside]
 
 
