@@ -180,7 +180,7 @@ class _Run:
     def warn(self, text: str) -> None:
         """Tell the user now, and again in the report."""
         self.warnings.append(text)
-        logger.warning("%s", text)
+        logger.info("warned: %s", text)  # to the log alone: the listener tells the user
         self.listener.warned(text)
 
     def stage(self, name: str, work: "partial[T]") -> T:

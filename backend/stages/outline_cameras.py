@@ -26,13 +26,14 @@ from .lens_refinement import focal_sigma
 from .lenses import rigid_matrix
 from .model_merit import fewest_confirming
 
-_WELL_CONFIRMED = 100
-"""Points that three photographs see, of the photograph with the fewest: with fifty, cameras of what is plain
-were still up to two degrees off."""
-_LEAST_MISS_PX = 0.3
-"""By which outlines miss each other for cameras to be moved: as much do masks that are off by a pixel."""
-_LARGEST_SHARE_LEFT = 0.5
-"""Of it, with cameras that are taken."""
+_WELL_CONFIRMED = 200
+"""Points that three photographs see, of the photograph with the fewest: with 160, cameras of what is plain
+were still up to 1.6 degrees off."""
+_MET_PX = 0.1
+"""By which the outlines of exact masks miss each other at most, and of those that are a pixel too wide."""
+_LARGEST_SHARE_LEFT = 0.25
+"""Of what outlines missed each other by before, with cameras that are taken although they miss by more: then
+the masks are rough, and a good fit to few outlines may be one to their faults."""
 _FEWEST_POINTS = 8
 """That must be left of the features, for what comes after lives on them."""
 _OFF_PX = 2.0
@@ -60,15 +61,13 @@ def held_against_outlines(
     scale = np.array([width_px / lens.width for width_px, lens in zip(widths_px, lenses, strict=True)])
     views = _posed(images, lenses, scale)
     before = outlines_miss_px(views, silhouettes)
-    if before <= _LEAST_MISS_PX:
-        return model, (_left(f"they miss each other by {before:.2f} px"),)
     seen = _sightings(database, [image.name for image in images], scale)
     sigma = np.array([focal_sigma(lens) for lens in lenses])
     fit = fit_to_outlines(views, silhouettes, seen.features, sigma, on_step)
     after = outlines_miss_px(fit.views, silhouettes)
     moved, num_points = _with_cameras(model, ids, fit, seen, scale)
     because = f"outlines missed each other by {before:.2f} px, with cameras that suit them by {after:.2f} px"
-    if not after < _LARGEST_SHARE_LEFT * before or num_points < _FEWEST_POINTS:
+    if after > max(_MET_PX, _LARGEST_SHARE_LEFT * before) or num_points < _FEWEST_POINTS:
         return model, (_left(because),)
     return moved, (Decision(what=HELD_AGAINST_OUTLINES, choice=ADJUSTED, because=because),)
 

@@ -281,7 +281,8 @@ def test_a_run_leaves_its_results_and_the_next_one_resumes(case: Case) -> None:
         Path(line).name for line in first.stdout.splitlines() if line.startswith(str(case.output))
     } >= RESULTS
     assert "noise" not in first.stdout.splitlines()[-1]
-    assert "Warning: 1 of 3 photographs could not be placed: 0.png (on purpose)." in first.stderr
+    assert "\nWarning: 1 of 3 photographs could not be placed: 0.png (on purpose).\n" in first.stderr
+    assert first.stderr.count("could not be placed") == 1
     assert "[4/7] stereo done in" in first.stderr
     assert len(read_mesh(case.output / "mesh.ply").faces) == 1
     second = case.run()
