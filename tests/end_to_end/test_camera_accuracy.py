@@ -85,13 +85,13 @@ def test_fountain_against_its_survey(
     [
         ("photos_banana/images", "*.JPG", 6, 6),
         ("photos_berlin3/images", "*.jpg", 3, 3),
-        ("photos_robovision_1/images", "*.png", 12, 9),
+        ("photos_robovision_1/images", "*.png", 12, 11),
     ],
 )
 def test_photographs_are_placed(
     folder: str, pattern: str, num_photos: int, num_placed: int, tmp_path: Path
 ) -> None:
-    """Of snapshots all, of very dark grey pictures on nothing three quarters."""
+    """Of snapshots all, of very dark grey pictures on nothing all but one at most."""
     paths = sorted((DATA / folder).glob(pattern))[:num_photos]
     assert len(paths) == num_photos
     are_placed(solve(paths, tmp_path), num_photos, num_placed)
