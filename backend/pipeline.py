@@ -52,7 +52,6 @@ from .stages.region import find_region
 from .stages.report import Report, ReportInputs, StageTiming, build_report
 from .stages.surface import Surface
 from .stages.train import TrainConfig, fit_surface
-from .stages.which_way_up import WHICH_WAY_UP
 from .wire.photographs import passed_over, passed_over_text
 from .workspace import StageCost, Workspace, check_free_space, content_of, fingerprint
 
@@ -310,8 +309,7 @@ def _placed(
     scratch = {"workdir": this.workspace.emptied_sfm_folder(), "seed": job.seed}
     solve = partial(stages.solve_cameras, photos, job.cameras, settings.cameras, **scratch)
     solved = this.stage("cameras", solve)
-    is_known = any(decision.what == WHICH_WAY_UP for decision in solved.decisions)
-    in_doubt = job.cameras is not None and may_be_unturned(job.cameras) and not is_known
+    in_doubt = job.cameras is not None and not solved.way_up_told and may_be_unturned(job.cameras)
     if in_doubt and (text := turned_text("cameras", photos)):
         this.warn(text)
     _warn_of_unplaced(solved, len(photos), this)

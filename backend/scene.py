@@ -163,6 +163,10 @@ class SolvedCameras:
     """Mean over the sparse points, in pixels of the photographs as placed; None where not estimated."""
     evidence: CameraEvidence | None = None
     """None where the cameras were given."""
+    suit_outlines: bool = False
+    """Whether estimated cameras were moved until the subject's outlines suit each other."""
+    way_up_told: bool = False
+    """Whether the photographs told which way up given cameras are."""
     decisions: tuple[Decision, ...] = ()
 
 

@@ -84,6 +84,8 @@ def solve_cameras(
         sparse_visibility=visibility,
         reprojection_error_px=placement.reprojection_error_px,
         evidence=placement.evidence,
+        suit_outlines=placement.suit_outlines,
+        way_up_told=placement.way_up_told,
         decisions=placement.decisions,
     )
 

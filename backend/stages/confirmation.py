@@ -14,9 +14,6 @@ FEWEST_CONFIRMING = 30
 """Of the photograph with the fewest. Measured (docs/benchmarks.md): with 35 and more, orientations were right
 to 1.7 degrees, with 19 and fewer wrong by 1 to 60."""
 
-HELD_AGAINST_OUTLINES, ADJUSTED = "estimated cameras, held against outlines", "adjusted"
-"""A decision of `outline_cameras`, and its choice where cameras were moved."""
-
 _ONE_PLACE = 0.015
 """Of the distance to the points: cameras nearer to each other, as those of a burst, stand in one place. They
 see a point less than a degree apart."""
@@ -62,7 +59,7 @@ def unconfirmed(solved: SolvedCameras) -> str | None:
         return None
     few = f"of {solved.views[weakest].name} only {confirming[weakest]} points are seen by three photographs"
     enough = f"from different places ({FEWEST_CONFIRMING} confirm a camera)"
-    if any((d.what, d.choice) == (HELD_AGAINST_OUTLINES, ADJUSTED) for d in solved.decisions):
+    if solved.suit_outlines:
         return (
             f"The cameras rest on the subject's outlines and may be a degree or two off: {few} {enough}. "
             "More photographs, or something with texture around the subject, would help."

@@ -80,6 +80,10 @@ class Placement:
     """The same."""
     estimated: bool = False
     """Whether FewView found the cameras from the photographs, be it in an earlier job."""
+    suit_outlines: bool = False
+    """Whether they were moved until the subject's outlines suit each other."""
+    way_up_told: bool = False
+    """Whether the photographs told which way up given cameras are."""
     decisions: tuple[Decision, ...] = ()
 
 

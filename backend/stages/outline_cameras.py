@@ -20,7 +20,6 @@ from ..maths.pieces import connected_pieces
 from ..maths.posed_views import PosedViews
 from ..maths.silhouette import silhouettes_or_none
 from ..scene import Decision, Photo
-from .confirmation import ADJUSTED, HELD_AGAINST_OUTLINES
 from .features import picture_index
 from .lens_refinement import focal_sigma
 from .lenses import rigid_matrix
@@ -43,7 +42,7 @@ _OFF_PX = 2.0
 def held_against_outlines(
     model: pycolmap.Reconstruction, database: Path, photos: Sequence[Photo], on_step: Callable[[], None]
 ) -> tuple[pycolmap.Reconstruction, tuple[Decision, ...]]:
-    """The model, or one whose cameras suit the outlines, and what decided it.
+    """The model itself, or another whose cameras suit the outlines, and what decided it.
 
     Only where points that three photographs see do not confirm the cameras well, and each photograph that was
     placed has a mask that shows the subject whole. Distortion is taken to be none then, for nothing tells it.
@@ -68,12 +67,12 @@ def held_against_outlines(
     moved, num_points = _with_cameras(model, ids, fit, seen, scale)
     because = f"outlines missed each other by {before:.2f} px, with cameras that suit them by {after:.2f} px"
     if after > max(_MET_PX, _LARGEST_SHARE_LEFT * before) or num_points < _FEWEST_POINTS:
-        return model, (_left(because),)
-    return moved, (Decision(what=HELD_AGAINST_OUTLINES, choice=ADJUSTED, because=because),)
+        return model, (_decision("left as they are", because),)
+    return moved, (_decision("adjusted", because),)
 
 
-def _left(because: str) -> Decision:
-    return Decision(what=HELD_AGAINST_OUTLINES, choice="left as they are", because=because)
+def _decision(choice: str, because: str) -> Decision:
+    return Decision(what="estimated cameras, held against outlines", choice=choice, because=because)
 
 
 def _posed(

@@ -1,6 +1,7 @@
 """Cameras from the photographs alone, by pycolmap's incremental mapping, set up for few photographs."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -50,10 +51,11 @@ def estimate_placement(
     decisions = (*features, *doubts, *refine_lenses(model, mapped_well=against_exif.keys()))
     _drop_bad_points(model)
     on_step = partial(progress, 0.98, "Holding cameras against outlines")
-    model, about_outlines = held_against_outlines(model, database, photos, on_step)
-    decisions = (*decisions, *about_outlines)
+    mapped = model
+    model, about_outlines = held_against_outlines(mapped, database, photos, on_step)
     require_parallax(model, database)
-    return _placement(model, photos, decisions, database)
+    placement = _placement(model, photos, database)
+    return replace(placement, suit_outlines=model is not mapped, decisions=(*decisions, *about_outlines))
 
 
 def _groups_against_exif(model: pycolmap.Reconstruction, groups: Sequence[LensGroup]) -> dict[int, LensGroup]:
@@ -85,7 +87,6 @@ def _drop_bad_points(model: pycolmap.Reconstruction) -> None:
 def _placement(
     model: pycolmap.Reconstruction,
     photos: Sequence[Photo],
-    decisions: tuple[Decision, ...],
     database: Path,
 ) -> Placement:
     images = sorted((picture_index(model.images[i].name), i) for i in model.reg_image_ids())
@@ -116,5 +117,4 @@ def _placement(
         reprojection_error_px=mean_error_px,
         evidence=evidence,
         estimated=True,
-        decisions=decisions,
     )

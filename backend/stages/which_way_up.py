@@ -15,8 +15,6 @@ from ..scene import Decision, Photo
 from .known_cameras import may_be_unturned, read_placement
 from .lenses import Placement
 
-WHICH_WAY_UP = "which way up the cameras are"
-"""What the decision is about."""
 PRECISE_PX = 0.5
 """Of points that count. To 2 px, where all photographs of an arc are upside down, 70 % of the right ones have
 a place too: seen so, a thing that bulges is a hollow."""
@@ -54,5 +52,5 @@ def read_placement_that_fits(
     if most < max(_FEWEST_POINTS, _CLEARLY_MORE * fewer):
         return upright
     because = f"so {most} points that photographs share have a place, and else {fewer}"
-    decision = Decision(what=WHICH_WAY_UP, choice=choice, because=because)
-    return replace(fitting, decisions=(*fitting.decisions, decision))
+    decision = Decision(what="which way up the cameras are", choice=choice, because=because)
+    return replace(fitting, way_up_told=True, decisions=(*fitting.decisions, decision))

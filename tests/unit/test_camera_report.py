@@ -20,9 +20,7 @@ from backend.stages.camera_report import (
     point_angles_deg,
 )
 from backend.stages.confirmation import (
-    ADJUSTED,
     FEWEST_CONFIRMING,
-    HELD_AGAINST_OUTLINES,
     num_confirming,
     unconfirmed,
 )
@@ -142,11 +140,10 @@ def test_cameras_that_rest_on_outlines_are_doubted_less() -> None:
     weak = replace(
         solved(), unplaced=(), evidence=all_strong(), sparse_visibility=np.zeros((80, 3), np.bool_)
     )
-    decided = Decision(what=HELD_AGAINST_OUTLINES, choice=ADJUSTED, because="outlines missed each other")
-    held = unconfirmed(replace(weak, decisions=(decided,)))
+    held = unconfirmed(replace(weak, suit_outlines=True))
     assert held is not None
     assert held.startswith("The cameras rest on the subject's outlines")
-    left = unconfirmed(replace(weak, decisions=(replace(decided, choice="left as they are"),)))
+    left = unconfirmed(weak)
     assert left is not None
     assert left.startswith("The cameras may be wrong")
     whole = tuple(replace(view, mask=np.ones(view.image_srgb.shape[:2], np.float32)) for view in weak.views)

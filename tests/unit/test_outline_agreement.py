@@ -15,7 +15,8 @@ from backend.maths.outline_agreement import incoherences, tangencies
 from backend.maths.outline_fit import Features, fit_to_outlines, outlines_miss_px
 from backend.maths.posed_views import POSE, PosedViews, posed_views
 from backend.maths.silhouette import Silhouette, silhouette_or_none
-from backend.scene import Photo
+from backend.scene import Photo, no_progress
+from backend.stages import structure_from_motion
 from backend.stages.features import picture_name
 from backend.stages.outline_cameras import held_against_outlines
 from tests.relative_rotations import rotation_errors_deg
@@ -255,6 +256,29 @@ def test_outlines_that_hardly_miss_each_other_tell_as_well(
     adjusted, (decision,) = held_against_outlines(model, tmp_path / "features.db", photos, lambda: None)
     assert decision.choice == "adjusted"
     assert worst_rotation_deg(posed(adjusted, views), views) < 0.5 * worst_rotation_deg(wrong, views)
+
+
+def test_a_placement_tells_whether_outlines_moved_its_cameras(
+    views: PosedViews, scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    database = tmp_path / "features.db"
+    model, photos = model_of(misplaced(views), scene, shared_features(views, 300), database)
+    adjusted, _ = held_against_outlines(model, database, photos, lambda: None)
+    without_masks = tuple(replace(photo, mask=None) for photo in photos)
+    monkeypatch.setattr(structure_from_motion, "refine_lenses", lambda *_, **__: ())
+    for mapped, shown, moved in [(model, photos, True), (adjusted, without_masks, False)]:
+        monkeypatch.setattr(
+            structure_from_motion, "best_model", lambda *_, found=mapped, **__: (found, database, ())
+        )
+        placement = structure_from_motion.estimate_placement(
+            shown,
+            max_side_px=scene.cameras[0].width // 2,
+            max_features=1000,
+            workdir=tmp_path,
+            seed=0,
+            progress=no_progress,
+        )
+        assert placement.suit_outlines == moved
 
 
 def roughened(mask: Float32[np.ndarray, "height width"], seed: int) -> Float32[np.ndarray, "height width"]:

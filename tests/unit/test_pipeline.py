@@ -16,8 +16,7 @@ from backend.errors import Cancelled, ErrorCode, ReconstructionError
 from backend.pipeline import Job, Listener, Stages
 from backend.presets import PRESETS
 from backend.records import load_record
-from backend.scene import Decision, Photo, Region, SolvedCameras
-from backend.stages.which_way_up import WHICH_WAY_UP
+from backend.scene import Photo, Region, SolvedCameras
 from backend.workspace import StageCost, open_workspace
 from tests.synthetic_scene import arc_cameras, photographed
 
@@ -208,9 +207,7 @@ def test_what_may_not_be_turned_with_its_photograph_is_told(
     Image.fromarray(np.eye(4, 6, dtype=np.uint8)).save(masks / "0.png")  # not white all over
     path = tmp_path / "transforms.json"
     path.write_text('{"frames": []}')
-    known = Decision(what=WHICH_WAY_UP, choice="of upright photographs", because="so it fits")
-    solved = photographed(arc_cameras(2, 20, 16)).solved()
-    solved = replace(solved, decisions=(known,) if cameras == "known" else ())
+    solved = replace(photographed(arc_cameras(2, 20, 16)).solved(), way_up_told=cameras == "known")
 
     def solve_cameras(*_: Any, **__: Any) -> SolvedCameras:
         return solved

@@ -17,7 +17,7 @@ from backend.stages.lenses import Placement, undistorted_view
 from backend.stages.nerfstudio import transforms_json
 from backend.stages.photos import PhotosConfig, load_photos
 from backend.stages.stored_pixels import turned_clockwise
-from backend.stages.which_way_up import WHICH_WAY_UP, read_placement_that_fits
+from backend.stages.which_way_up import read_placement_that_fits
 from tests.lens_models import LENSES
 from tests.synthetic_scene import Scene, arc_cameras, photographed, write_scene
 
@@ -118,8 +118,10 @@ def test_of_photographs_upside_down_the_cameras_that_fit_are_taken(
     photos = load_photos([tmp_path / "images"], None, PhotosConfig(), progress=no_progress)
     given = tmp_path / "images" / "transforms.json"
     solved = solve_cameras(photos, given, CamerasConfig(), workdir=tmp_path, seed=0, progress=no_progress)
-    (told,) = [decision.choice for decision in solved.decisions if decision.what == WHICH_WAY_UP]
-    assert told == ("of pixels as they are stored" if stored else "of upright photographs")
+    assert solved.way_up_told
+    assert solved.decisions[-1].choice == (
+        "of pixels as they are stored" if stored else "of upright photographs"
+    )
     half_turn = np.diag([-1.0, -1.0, 1.0, 1.0])
     for index, (view, true) in enumerate(zip(solved.views, scene.views, strict=True)):
         pose = true.camera.camera_from_world
