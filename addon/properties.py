@@ -195,6 +195,11 @@ class FEWVIEW_PG_settings(bpy.types.PropertyGroup):
         ],
         default="balanced",
     )
+    without_ground: BoolProperty(
+        name="Without Ground",
+        description="Leave out the flat ground that the subject stands on. Masks do that by themselves",
+        default=False,
+    )
     device: EnumProperty(
         name="Device",
         items=[

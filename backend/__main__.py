@@ -71,13 +71,21 @@ def _reconstruct(parser: argparse.ArgumentParser, parsed: argparse.Namespace) ->
         region = {"region_centre": tuple(centre), "region_radius": radius}
     budget = {} if parsed.budget_seconds is None else {"budget_s": parsed.budget_seconds}
     if len(parsed.images) == 1 and parsed.images[0].endswith(".json"):
-        options = [*given, *(["region"] if region else []), *(["budget-seconds"] if budget else [])]
+        rest = {"region": region, "budget-seconds": budget, "without-ground": parsed.without_ground}
+        options = [*given, *(name for name, value in rest.items() if value)]
         if options:
             parser.error(f"with a job file, {', '.join('--' + name for name in options)} stands in the file")
         return on_wire(Path(parsed.images[0]))
     if "output" not in given:
         parser.error("--output is needed")
-    job = Job(protocol=PROTOCOL_VERSION, images=tuple(parsed.images), **given, **region, **budget)
+    job = Job(
+        protocol=PROTOCOL_VERSION,
+        images=tuple(parsed.images),
+        without_ground=parsed.without_ground,
+        **given,
+        **region,
+        **budget,
+    )
     return on_terminal(job, stop_with_stdin=parsed.stop_with_stdin)
 
 
@@ -133,6 +141,7 @@ def _parser() -> argparse.ArgumentParser:
         metavar=("X", "Y", "Z", "RADIUS"),
         help="sphere to reconstruct, in the frame of the cameras; else it is found",
     )
+    add("--without-ground", action="store_true", help="leave out the flat ground that the subject stands on")
     add(
         "--budget-seconds",
         type=positive_seconds,

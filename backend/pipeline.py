@@ -342,6 +342,8 @@ def _reconstructed(
     stereo = this.stage("stereo", match)
     if settings.stereo is not None and (lack := hollows_filled(stereo, region)):
         this.warn(lack)
+    if stereo.doubt:
+        this.warn(stereo.doubt)
     for doubt in disagreement(solved, stereo):
         this.warn(doubt)
     solved = with_refined(solved, stereo)

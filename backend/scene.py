@@ -239,6 +239,21 @@ class DepthMap:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Ground:
+    """What the subject stands on, object frame: all x with normal . x = offset; nothing of it is below."""
+
+    normal: Float64[np.ndarray, "3"]
+    """Unit, upwards."""
+    offset: float
+    thickness: float
+    """Up to this height what was measured is the ground's."""
+
+    def height(self, points: Float64[np.ndarray, "*batch 3"]) -> Float64[np.ndarray, "*batch"]:
+        """Above the plane; < 0 below it."""
+        return np.asarray(points @ self.normal - self.offset)
+
+
+@dataclass(frozen=True, kw_only=True)
 class StereoResult:
     """Points of the surface and the depth maps they come from, one per view."""
 
@@ -249,6 +264,10 @@ class StereoResult:
     beside_lines_px: float | None = None
     """How far patches of surface lie beside their epipolar lines for the worst of given cameras; None where
     these were estimated, or too few patches tell."""
+    ground: Ground | None = None
+    """Left out of points and depth maps; None where it is not, or there is none."""
+    doubt: str | None = None
+    """For a person: what was asked for and could not be done; None if nothing was."""
     decisions: tuple[Decision, ...] = ()
 
 

@@ -208,17 +208,32 @@ def ring_cameras(count: int, width: int) -> list[Camera]:
     return arc_cameras(count, 360.0 * (count - 1) / count, width)
 
 
-def photographed(cameras: list[Camera], *, textured: bool = True, wall: bool = False) -> Scene:
-    """The body from each camera, masked, before black or a textured wall; evenly grey without texture."""
+GROUND_Z = CENTRE[2] - 0.68 * SIZE
+"""Of the ground, which the body's lowest part sinks into by a little."""
+
+
+def photographed(
+    cameras: list[Camera], *, textured: bool = True, wall: bool = False, ground: bool = False
+) -> Scene:
+    """The body from each camera, masked, before black or a textured wall; evenly grey without texture.
+
+    With `ground` it lies on a textured disc of 2.5 SIZE; depths and masks are of the body all the same.
+    """
     views, depths, normals = [], [], []
     for index, camera in enumerate(cameras):
         origins, directions = camera_rays(camera)
         hits = true_caster().cast(origins, directions)
         hit, shape = hits.hit, (camera.height, camera.width)
+        to_ground = ground_distance(origins, directions) if ground else np.full(len(hit), np.inf)
+        hit &= hits.distance < to_ground
         points = origins[hit] + hits.distance[hit, None] * directions[hit]
         image = np.zeros((len(hit), 3), np.float32)
         if wall:
             image[~hit] = _wall_srgb(origins[~hit], directions[~hit])
+        on_ground = ~hit & np.isfinite(to_ground)
+        image[on_ground] = texture_srgb(
+            origins[on_ground] + to_ground[on_ground, None] * directions[on_ground] + SIZE
+        )
         image[hit] = texture_srgb(points) if textured else 0.8
         depth, normal = np.full(len(hit), np.inf), np.zeros((len(hit), 3))
         depth[hit] = (points - camera.position) @ camera.camera_from_world[2, :3]
@@ -229,6 +244,14 @@ def photographed(cameras: list[Camera], *, textured: bool = True, wall: bool = F
         depths.append(depth.reshape(shape))
         normals.append(normal.reshape(*shape, 3))
     return Scene(views=tuple(views), depths=tuple(depths), normals=tuple(normals))
+
+
+def ground_distance(origins: Points, directions: Points) -> Float64[np.ndarray, "points"]:
+    """How far along rays the ground is, in lengths of their directions; infinite where they miss it."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        along = (GROUND_Z - origins[:, 2]) / directions[:, 2]
+        across = np.linalg.norm((origins + along[:, None] * directions - CENTRE)[:, :2], axis=1)
+    return np.where((along > 0) & (across < 2.5 * SIZE), along, np.inf)
 
 
 def _wall_srgb(origins: Points, directions: Points) -> Points:

@@ -102,6 +102,7 @@ class FEWVIEW_OT_reconstruct(bpy.types.Operator):
     )
     masks: argument("masks")
     preset: argument("preset")
+    without_ground: argument("without_ground")
     device: argument("device")
     seed: argument("seed")
     truth: argument("truth")
@@ -121,7 +122,7 @@ class FEWVIEW_OT_reconstruct(bpy.types.Operator):
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         """Start; without a window, wait for the end."""
-        same = ("preset", "device", "seed", *(() if self.images else ("masks", "truth")))
+        same = ("preset", "without_ground", "device", "seed", *(() if self.images else ("masks", "truth")))
         fill_in(self, settings_of(context), {name: name for name in same})
         python, reason = backend_python_or_reason(context)
         try:
@@ -160,6 +161,7 @@ class FEWVIEW_OT_reconstruct(bpy.types.Operator):
             truth=absolute(self.truth) if self.truth else None,
             region_centre=centre,
             region_radius=radius,
+            without_ground=self.without_ground,
             keep_stages=False,
         )
 

@@ -166,11 +166,20 @@ def resolve(job: protocol.Job, base: Path) -> "Job":
 
 
 def settings_of(job: protocol.Job) -> "Settings":
-    """The preset's settings, with the job's budget, and its region where it names one."""
+    """The preset's settings, with the job's budget, its region where it names one, and without the ground.
+
+    Raises ReconstructionError(SETTINGS_INVALID) where the preset cannot tell the ground.
+    """
     from ..presets import PRESETS
 
     settings = PRESETS[job.preset]
     settings = replace(settings, train=replace(settings.train, budget_s=job.budget_s))
+    if job.without_ground:
+        if settings.stereo is None:
+            text = f"The preset {job.preset} measures no points, so it cannot leave out the ground."
+            remedy = "Take fast, balanced or detailed, or keep the ground."
+            raise ReconstructionError(ErrorCode.SETTINGS_INVALID, text, remedy)
+        settings = replace(settings, stereo=replace(settings.stereo, without_ground=True))
     if job.region_centre is None or job.region_radius is None:
         return settings
     x, y, z = job.region_centre

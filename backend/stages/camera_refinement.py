@@ -33,6 +33,7 @@ from ..scene import (
     transform_points,
 )
 from .bundle_adjustment import adjust_bundle
+from .ground import without_ground
 from .lenses import rigid_matrix
 from .stereo import match_views, unmatched
 from .stereo_config import StereoConfig
@@ -116,16 +117,22 @@ def match_solved(
         return unmatched(solved.views)
     work = partial(match_views, region=region, config=config, device=device)
     found = work(solved.views, progress=progress)
-    if not solved.estimated:
+    if solved.estimated:
+        refined = refine_cameras(solved.views, region, found.points, device=device)
+        if refined.cameras is not None:
+            views = with_cameras(solved.views, refined.cameras)
+            found = work(views, progress=lambda share, text: progress(share, f"{text}, again"))
+        decisions = (*found.decisions, refined.decision)
+        found = replace(found, refined_cameras=refined.cameras, decisions=decisions)
+    else:
         with torch.no_grad():
             seen = find_patches(solved.views, region, found.points, device=device)
-        return replace(found, beside_lines_px=misplaced_px([view.camera for view in solved.views], seen))
-    refined = refine_cameras(solved.views, region, found.points, device=device)
-    if refined.cameras is not None:
-        views = with_cameras(solved.views, refined.cameras)
-        found = work(views, progress=lambda share, text: progress(share, f"{text}, again"))
-    decisions = (*found.decisions, refined.decision)
-    return replace(found, refined_cameras=refined.cameras, decisions=decisions)
+        beside_lines_px = misplaced_px([view.camera for view in solved.views], seen)
+        found = replace(found, beside_lines_px=beside_lines_px)
+    if not config.without_ground:
+        return found
+    progress(1.0, "leaving out the ground")
+    return without_ground(found, with_refined(solved, found).views, region, config)
 
 
 def with_refined(solved: SolvedCameras, stereo: StereoResult) -> SolvedCameras:

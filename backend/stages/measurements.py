@@ -9,7 +9,7 @@ from torch import Tensor
 
 from ..maths.geometry import Pinhole, pinhole_in_object
 from ..maths.silhouette import outline_distance_px
-from ..scene import Region, StereoResult, View
+from ..scene import Ground, Region, StereoResult, View
 
 SURE = 0.3
 """Confidence of a depth that carves, or that opens a scene at the pictures' edges.
@@ -43,6 +43,8 @@ class Measurements:
     """Which view measured each point."""
     region_centre: Float[Tensor, "3"]
     region_radius: float
+    ground: Ground | None = None
+    """Below it there is nothing; None where none was left out."""
 
     @property
     def sure_depths(self) -> list[Float[Tensor, "height width"]]:
@@ -80,6 +82,7 @@ def measurements(
         view_index=view_index,
         region_centre=torch.zeros(3, device=device),
         region_radius=1.0,
+        ground=stereo.ground,
     )
 
 
@@ -96,6 +99,10 @@ def carried(
     device = scene.positions.device
     scale = float(frame_from_object[0, 0])
     middle = torch.tensor(frame_from_object[:3, 3], dtype=torch.float32, device=device)
+    ground = scene.ground
+    if ground is not None:
+        offset = scale * ground.offset + float(ground.normal @ frame_from_object[:3, 3])
+        ground = replace(ground, offset=offset, thickness=scale * ground.thickness)
     return replace(
         scene,
         cameras=[pinhole_in_object(view.camera, region.part(frame_from_object), device) for view in views],
@@ -103,6 +110,7 @@ def carried(
         positions=scene.positions * scale + middle,
         region_centre=middle,
         region_radius=scale,
+        ground=ground,
     )
 
 

@@ -53,6 +53,10 @@ _SHORTEST = 1e-6
 _MORE_FACES = 1.2
 """Times as many as were asked for, where so few can not be closed; its square after that, and so on."""
 
+_SMALLEST_STANDING = 0.1
+"""Where the ground was left out, pieces with a smaller share of the largest one's area are of its edges, or
+of what stands behind."""
+
 _LOOSE_REACHES = 5.0
 """How far surface goes on beyond what was measured, in what a measurement reaches, in a larger scene."""
 
@@ -93,6 +97,8 @@ def extract_mesh(
     the field has no zero level, and PHOTO_UNREADABLE.
     """
     progress(0.0, "level set")
+    if stereo.ground is not None:
+        config = replace(config, smallest_piece=max(config.smallest_piece, _SMALLEST_STANDING))
     whole = _without_floating(surface, config)
     progress(0.2, "simplifying")
     points = transform_points(region.world_from_object, stereo.points.positions.astype(np.float64))

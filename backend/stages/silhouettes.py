@@ -19,11 +19,14 @@ _AROUND = 1.75
 
 
 def least_distance(scene: Measurements, nodes: int) -> Float[Tensor, "nodes nodes nodes"]:
-    """A bound that the distance is not below where it is > 0: off any silhouette, before any empty backdrop
-    and outside the region."""
+    """A bound that the distance is not below where it is > 0: off any silhouette, before any empty backdrop,
+    below the ground and outside the region."""
     points = node_positions(nodes, scene.positions.device)
     bound = (points - scene.region_centre).norm(dim=-1) - 0.97 * scene.region_radius
     bound = torch.maximum(bound, points.abs().amax(dim=-1) - (1 - spacing(nodes)))
+    if scene.ground is not None:
+        normal = torch.tensor(scene.ground.normal).to(points)
+        bound = torch.maximum(bound, scene.ground.offset - points @ normal)
     for camera, outline, backdrop in zip(scene.cameras, scene.outlines, scene.backdrops, strict=True):
         edge = outline if outline is not None else backdrop
         if edge is not None:

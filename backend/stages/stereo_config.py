@@ -56,5 +56,7 @@ class StereoConfig:
     """Patches must agree this well to be grown from: what is hardly measured is not passed on."""
     min_piece_px: int = 300
     """Pixels of a connected piece of measured surface, at least; six patches side by side."""
+    without_ground: bool = False
+    """Whether the flat ground that the subject stands on is left out of what was measured."""
     noise: float = 1.2 / 255
     """Standard deviation of sensor and coding noise in a flat patch of a well exposed photograph."""

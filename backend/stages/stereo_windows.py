@@ -97,6 +97,24 @@ def pyramid(view: View, region: Region, config: StereoConfig, device: torch.devi
         camera = camera.cropped(0, 0, 2 * width, 2 * height).scaled(width, height)
 
 
+def whole_picture(view: View, region: Region, config: StereoConfig) -> Window:
+    """The whole view at its own size as a window, with whatever it shows."""
+    grey = torch.tensor(view.image_srgb).mean(dim=2)
+    everywhere = torch.ones_like(grey)
+    flat = without_local_mean(grey, everywhere, 2 * config.patch_radius)
+    return Window(
+        left=0,
+        top=0,
+        pixel_size=1,
+        camera=pinhole_in_object(view.camera, region, torch.device("cpu")),
+        grey=flat,
+        patches=patch_statistics(flat, everywhere, config.patch_radius),
+        noise=config.noise * _exposure(grey),
+        subject=everywhere > 0,
+        surrounded=True,
+    )
+
+
 def _exposure(grey: Float[Tensor, "height width"]) -> float:
     """1 for a well exposed photograph, less for a dark one, whose noise is darker too."""
     bright = float(torch.quantile(grey.flatten()[:: max(1, grey.numel() // 100_000)], 0.99))

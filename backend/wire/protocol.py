@@ -66,6 +66,8 @@ class Job:
     region_centre: tuple[float, ...] | None = None
     """Of the sphere to reconstruct, three numbers in the frame of the cameras; None to find it."""
     region_radius: float | None = None
+    without_ground: bool = False
+    """Whether the flat ground that the subject stands on is left out."""
     budget_s: float | None = None
     """Time for fitting the surface; None for as long as the preset needs."""
     until: str = "report"

@@ -10,6 +10,7 @@ import backend.__main__ as program
 from backend import waiting
 from backend.commands.install import Plan
 from backend.commands.reconstruct import settings_of
+from backend.errors import ReconstructionError
 from backend.wire.protocol import Job
 
 
@@ -39,6 +40,7 @@ def test_without_a_region_it_is_found(jobs: list[Job]) -> None:
         (["photos", "--output", "o", "--region", "1", "2", "3"], "expected 4"),
         (["job.json", "--region", "1", "2", "3", "4"], "--region stands in the file"),
         (["job.json", "--budget-seconds", "4"], "--budget-seconds stands in the file"),
+        (["job.json", "--without-ground"], "--without-ground stands in the file"),
     ],
 )
 def test_wrong_regions_and_double_options_end_with_a_sentence(
@@ -56,6 +58,20 @@ def test_a_budget_is_in_seconds(jobs: list[Job]) -> None:
     program.run(["reconstruct", "photos", "--output", "o", "--budget-seconds", "12.5"])
     assert [job.budget_s for job in jobs] == [None, 12.5]
     assert [settings_of(job).train.budget_s for job in jobs] == [None, 12.5]
+
+
+def test_the_ground_is_kept_unless_it_is_to_be_left_out(jobs: list[Job]) -> None:
+    program.run(["reconstruct", "photos", "--output", "o"])
+    program.run(["reconstruct", "photos", "--output", "o", "--without-ground"])
+    assert [job.without_ground for job in jobs] == [False, True]
+    stereo = [settings_of(job).stereo for job in jobs]
+    assert [config.without_ground for config in stereo if config is not None] == [False, True]
+
+
+def test_a_preset_without_points_cannot_leave_out_the_ground(jobs: list[Job]) -> None:
+    program.run(["reconstruct", "photos", "--output", "o", "--without-ground", "--preset", "nerf"])
+    with pytest.raises(ReconstructionError, match="The preset nerf measures no points"):
+        settings_of(jobs[0])
 
 
 @pytest.mark.parametrize("words", [["0"], ["-3"], ["nan"], ["inf"], ["soon"]])

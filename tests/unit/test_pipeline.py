@@ -16,9 +16,11 @@ from backend.errors import Cancelled, ErrorCode, ReconstructionError
 from backend.pipeline import Job, Listener, Stages
 from backend.presets import PRESETS
 from backend.records import load_record
-from backend.scene import Photo, Region, SolvedCameras
+from backend.scene import Photo, Region, SolvedCameras, StereoResult
+from backend.stages.stereo import unmatched
+from backend.stages.surface import Surface
 from backend.workspace import StageCost, open_workspace
-from tests.synthetic_scene import arc_cameras, photographed
+from tests.synthetic_scene import arc_cameras, photographed, true_region
 
 SETTINGS = PRESETS["fast"]
 
@@ -226,6 +228,38 @@ def test_what_may_not_be_turned_with_its_photograph_is_told(
     assert [text.partition(" are taken")[0] for text in warned] == [
         f"EXIF asks to turn 1.png: their {what}" for what in expected
     ]
+
+
+def test_what_stages_doubt_is_told(photos: Path) -> None:
+    scene = photographed(arc_cameras(2, 20, 16))
+    views = tuple(replace(view, name=f"{index}.png") for index, view in enumerate(scene.views))
+    solved = replace(scene, views=views).solved()
+
+    def solve_cameras(*_: Any, **__: Any) -> SolvedCameras:
+        return solved
+
+    def find_region(*_: Any, **__: Any) -> Region:
+        return replace(true_region(), doubt="the region's doubt")
+
+    def match_views(*_: Any, **__: Any) -> StereoResult:
+        return replace(unmatched(solved.views), doubt="stereo's doubt")
+
+    def fit_surface(*_: Any, **__: Any) -> Surface:
+        raise Cancelled
+
+    warned: list[str] = []
+    listener = Quiet()
+    listener.warned = warned.append  # type: ignore[method-assign]
+    stages = Stages(
+        solve_cameras=solve_cameras,
+        find_region=find_region,
+        match_views=match_views,
+        fit_surface=fit_surface,
+    )
+    job = job_of(photos)
+    with open_workspace(job.output) as opened, pytest.raises(Cancelled):
+        pipeline.run(job, opened, settings=SETTINGS, stages=stages, listener=listener)
+    assert [text for text in warned if "doubt" in text] == ["the region's doubt", "stereo's doubt"]
 
 
 def test_a_finished_job_is_not_replaced_by_another_shoot(photos: Path, tmp_path: Path) -> None:

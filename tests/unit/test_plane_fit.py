@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from jaxtyping import Float64
 
-from backend.maths.plane_fit import plane_of_most
+from backend.maths.plane_fit import plane_of_most, plane_under_most
 
 TOLERANCE = 0.01
 NORMAL = np.array([2.0, -1.0, 2.0]) / 3
@@ -38,6 +38,31 @@ def test_what_lies_elsewhere_has_no_part_in_it(wrong: int) -> None:
 
 def test_of_points_on_a_line_there_is_no_plane() -> None:
     assert plane_of_most(np.linspace(0, 1, 40)[:, None] * [[1.0, 2.0, 3.0]], TOLERANCE) is None
+
+
+def test_the_plane_under_most_has_all_eyes_above_and_points_up() -> None:
+    """Even if more points lie on another one, which has the rest below it."""
+    lid = on_plane(120, noise=0.3 * TOLERANCE) + 0.5 * NORMAL
+    points = np.concatenate([lid, on_plane(40, noise=0.3 * TOLERANCE)])
+    for side in (1.0, -1.0):
+        plane = plane_under_most(side * points, side * 3 * NORMAL[None], TOLERANCE, 0.2)
+        assert plane is not None
+        assert side * plane.normal @ NORMAL > 1 - 1e-5
+        assert plane.within.sum() == 40
+        assert plane.distance(side * lid) == pytest.approx(0.5, abs=2 * TOLERANCE)
+
+
+def test_few_points_below_are_allowed() -> None:
+    below = on_plane(10) - 0.5 * NORMAL
+    points = np.concatenate([below, on_plane(40)])
+    assert plane_under_most(points, 3 * NORMAL[None], TOLERANCE, 0.3) is not None
+    few = plane_under_most(points, 3 * NORMAL[None], TOLERANCE, 0.2)
+    assert few is None or few.within.sum() <= 10
+
+
+def test_no_plane_is_under_eyes_on_both_sides_of_it() -> None:
+    eyes = np.array([3 * NORMAL, -NORMAL])
+    assert plane_under_most(on_plane(40), eyes, TOLERANCE, 0.2) is None
 
 
 def test_the_same_points_have_the_same_plane() -> None:

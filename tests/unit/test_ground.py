@@ -1,0 +1,209 @@
+"""The flat ground below a subject: found where it is one, told from the subject, and left out."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from jaxtyping import Float64
+from scipy.ndimage import binary_dilation
+
+from backend.maths.grid import node_positions
+from backend.scene import DepthMap, Ground, StereoResult, SurfacePoints, transform_points
+from backend.stages.ground import find_ground, without_ground
+from backend.stages.measurements import carried, measurements
+from backend.stages.silhouettes import least_distance
+from backend.stages.stereo_config import StereoConfig
+from tests.synthetic_scene import (
+    CENTRE,
+    GROUND_Z,
+    OBJECT_UNIT,
+    Scene,
+    camera_at,
+    ground_distance,
+    photographed,
+    texture_srgb,
+    true_region,
+)
+
+EYES = np.array([[-0.5, -2.0, 1.5], [0.5, -2.0, 1.5]])
+GROUND = (GROUND_Z - CENTRE[2]) / OBJECT_UNIT
+"""Its height in the object frame, whose axes are the world's."""
+
+
+def points_at(positions: Float64[np.ndarray, "points 3"], confidence: float = 1.0) -> SurfacePoints:
+    num = len(positions)
+    return SurfacePoints(
+        positions=positions.astype(np.float32),
+        normals=np.tile(np.float32([0, 0, 1]), (num, 1)),
+        colours_srgb=np.full((num, 3), 0.5, np.float32),
+        confidence=np.full(num, confidence, np.float32),
+        num_views=np.full(num, 2),
+        view_index=np.zeros(num, np.int64),
+    )
+
+
+def disc(z: float, num: int = 3000, noise: float = 0.002) -> Float64[np.ndarray, "points 3"]:
+    rng = np.random.default_rng(0)
+    radius, angle = np.sqrt(rng.random(num)), 2 * np.pi * rng.random(num)
+    return np.stack([radius * np.cos(angle), radius * np.sin(angle), z + noise * rng.normal(size=num)], -1)
+
+
+def ball(z: float, num: int = 1000) -> Float64[np.ndarray, "points 3"]:
+    directions = np.random.default_rng(1).normal(size=(num, 3))
+    return 0.3 * directions / np.linalg.norm(directions, axis=1, keepdims=True) + [0, 0, z]
+
+
+def test_a_plane_with_something_on_it_is_ground() -> None:
+    points = points_at(np.concatenate([disc(-0.2), ball(0.1)]))
+    for eyes in (EYES, EYES[::-1]):
+        ground, because = find_ground(points, eyes)
+        assert ground is not None
+        np.testing.assert_allclose(ground.normal, [0, 0, 1], atol=2e-3)
+        assert ground.offset == pytest.approx(-0.2, abs=1e-3)
+        assert 0.004 < ground.thickness < 0.008  # three standard deviations
+        assert because == ("of the points that are surely measured 75% lie on a plane and 25% above it")
+
+
+@pytest.mark.parametrize(
+    "positions",
+    [
+        pytest.param(ball(0.0), id="no plane"),
+        pytest.param(disc(0.0), id="nothing on it"),
+        pytest.param(np.concatenate([disc(0.3), ball(0.0)]), id="a lid: the rest is below"),
+        pytest.param(np.concatenate([disc(2.0), ball(2.5)]), id="above the cameras"),
+        pytest.param(disc(0.0, num=2), id="two points"),
+        pytest.param(np.zeros((0, 3)), id="no points"),
+    ],
+)
+def test_what_is_no_ground(positions: Float64[np.ndarray, "points 3"]) -> None:
+    assert find_ground(points_at(positions), EYES)[0] is None
+
+
+def test_unsure_points_tell_no_ground() -> None:
+    positions = np.concatenate([disc(-0.2), ball(0.1)])
+    assert find_ground(points_at(positions, confidence=0.1), EYES)[0] is None
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    """The body on a textured ground, without masks."""
+    cameras = [camera_at(azimuth, 2.5, 480) for azimuth in (-30.0, -10.0, 10.0, 30.0)]
+    return photographed(cameras, ground=True, wall=True).without_masks()
+
+
+@pytest.fixture(scope="module")
+def stereo(scene: Scene) -> StereoResult:
+    """All that is in the region is measured truly, but for what lies within 4 px of the body's outline."""
+    maps, positions, views = [], [], []
+    for index, (view, depth) in enumerate(zip(scene.views, scene.depths, strict=True)):
+        height, width = depth.shape
+        rows, columns = np.mgrid[0:height, 0:width] + 0.5
+        camera = view.camera
+        across = np.stack(
+            [
+                (columns - camera.cx_px) / camera.fx_px,
+                (rows - camera.cy_px) / camera.fy_px,
+                np.ones(depth.shape),
+            ],
+            axis=-1,
+        ).reshape(-1, 3)
+        directions = across @ camera.camera_from_world[:3, :3]
+        to_ground = ground_distance(np.tile(camera.position, (len(across), 1)), directions)
+        shown = np.minimum(depth.ravel(), to_ground)
+        world = camera.position + np.where(np.isfinite(shown), shown, 0)[:, None] * directions
+        inside = np.linalg.norm(transform_points(true_region().object_from_world, world), axis=1) < 1
+        body = np.isfinite(depth)
+        unknown = binary_dilation(body, iterations=4) & binary_dilation(~body, iterations=4)
+        known = (np.isfinite(shown) & inside).reshape(depth.shape) & ~unknown
+        measured = np.where(known, shown.reshape(depth.shape) / OBJECT_UNIT, 0).astype(np.float32)
+        maps.append(DepthMap(depth=measured, confidence=known.astype(np.float32), empty=None, subject=None))
+        positions.append(world[known.ravel()][::10])
+        views.append(np.full(len(positions[-1]), index))
+    world = np.concatenate(positions)
+    points = points_at(transform_points(true_region().object_from_world, world))
+    colours = texture_srgb(world).astype(np.float32)
+    points = replace(points, colours_srgb=colours, view_index=np.concatenate(views))
+    return StereoResult(points=points, depth_maps=tuple(maps))
+
+
+@pytest.fixture(scope="module")
+def alone(scene: Scene, stereo: StereoResult) -> StereoResult:
+    return without_ground(stereo, scene.views, true_region(), StereoConfig())
+
+
+def test_the_ground_is_where_it_is(alone: StereoResult) -> None:
+    assert alone.ground is not None
+    np.testing.assert_allclose(alone.ground.normal, [0, 0, 1], atol=1e-3)
+    assert alone.ground.offset == pytest.approx(GROUND, abs=1e-3)
+    assert alone.doubt is None
+    assert [(d.what, d.choice) for d in alone.decisions] == [("ground", "left out")]
+
+
+def test_its_points_are_gone_and_those_of_the_subject_stay(stereo: StereoResult, alone: StereoResult) -> None:
+    before, after = stereo.points.positions, alone.points.positions
+    assert alone.ground is not None
+    low = before[:, 2] < GROUND + alone.ground.thickness
+    assert 0.1 < low.mean() < 0.8
+    np.testing.assert_array_equal(after, before[~low])
+    np.testing.assert_array_equal(alone.points.view_index, stereo.points.view_index[~low])
+
+
+def test_pixels_that_show_it_are_empty_up_to_the_subject_s_outline(scene: Scene, alone: StereoResult) -> None:
+    """Also where nothing was measured: beside the outline, though body and ground look the same there."""
+    for body, map_ in zip(scene.coverage, alone.depth_maps, strict=True):
+        assert map_.empty is not None
+        assert map_.subject is not None
+        assert (map_.empty & body).sum() < 0.01 * body.sum()
+        beside = binary_dilation(body, iterations=5) & ~body
+        beside[: body.shape[0] * 6 // 10] = False  # below, where the ground is behind the outline
+        assert (map_.empty & beside).sum() > 0.6 * beside.sum()
+        assert (map_.subject & ~body).sum() < 0.01 * body.sum()
+        assert (map_.subject & body).sum() > 0.6 * body.sum()
+        assert not (map_.empty & map_.subject).any()
+        assert not map_.depth[map_.empty].any()
+        assert not map_.confidence[map_.empty].any()
+
+
+def test_below_it_nothing_is(scene: Scene, alone: StereoResult) -> None:
+    """In the region's frame and in one that is laid around a part of it."""
+    measured = measurements(scene.views, true_region(), alone, torch.device("cpu"))
+    bare = replace(measured, backdrops=[None] * len(scene.views))
+    points = node_positions(24, torch.device("cpu"))
+    below = GROUND - points[..., 2]
+    bound = least_distance(bare, 24)
+    assert (bound >= below - 1e-4).all()
+    around = least_distance(replace(bare, ground=None), 24)
+    assert torch.equal(bound, torch.maximum(around, bound))
+    assert (bound - around)[..., 12, 12, :].max() > 0.3
+    frame_from_object = np.diag([2.0, 2.0, 2.0, 1.0])
+    frame_from_object[:3, 3] = [0.1, -0.2, 0.3]
+    part = carried(bare, scene.views, true_region(), frame_from_object)
+    expected = (2 * GROUND + 0.3) - points[..., 2]
+    assert (least_distance(part, 24) >= expected - 1e-4).all()
+    assert part.ground is not None
+    assert alone.ground is not None
+    assert part.ground.thickness == pytest.approx(2 * alone.ground.thickness)
+
+
+def test_masks_say_what_the_subject_is(scene: Scene, stereo: StereoResult) -> None:
+    views = tuple(replace(view, mask=np.ones_like(view.image_srgb[..., 0])) for view in scene.views)
+    kept = without_ground(stereo, views, true_region(), StereoConfig())
+    assert kept.ground is None
+    assert kept.doubt is not None
+    assert "the photographs have masks" in kept.doubt
+    assert kept.points is stereo.points
+
+
+def test_without_ground_nothing_changes_but_the_user_is_told(scene: Scene, stereo: StereoResult) -> None:
+    high = stereo.points.positions[:, 2] > GROUND + 0.05
+    points = points_at(stereo.points.positions[high].astype(np.float64))
+    kept = without_ground(replace(stereo, points=points), scene.views, true_region(), StereoConfig())
+    assert kept.doubt is not None
+    assert kept.doubt.startswith("There is no flat ground to leave out: ")
+    assert (kept.ground, kept.depth_maps) == (None, stereo.depth_maps)
+
+
+def test_height_is_above_the_plane() -> None:
+    ground = Ground(normal=np.array([0.0, 0.6, 0.8]), offset=0.5, thickness=0.01)
+    assert ground.height(np.array([[0.0, 0.3, 0.4], [1.0, 0.6, 0.8]])) == pytest.approx([0.0, 0.5])
