@@ -165,25 +165,22 @@ def test_pixels_that_show_it_are_empty_up_to_the_subject_s_outline(scene: Scene,
         assert not map_.confidence[map_.empty].any()
 
 
-def test_below_it_nothing_is(scene: Scene, alone: StereoResult) -> None:
+@pytest.mark.parametrize("scale", [1.0, 1.5])
+def test_below_it_nothing_is(scale: float, scene: Scene, alone: StereoResult) -> None:
     """In the region's frame and in one that is laid around a part of it."""
     measured = measurements(scene.views, true_region(), alone, torch.device("cpu"))
-    bare = replace(measured, backdrops=[None] * len(scene.views))
-    points = node_positions(24, torch.device("cpu"))
-    below = GROUND - points[..., 2]
-    bound = least_distance(bare, 24)
-    assert (bound >= below - 1e-4).all()
-    around = least_distance(replace(bare, ground=None), 24)
-    assert torch.equal(bound, torch.maximum(around, bound))
-    assert (bound - around)[..., 12, 12, :].max() > 0.3
-    frame_from_object = np.diag([2.0, 2.0, 2.0, 1.0])
+    frame_from_object = np.diag([scale, scale, scale, 1.0])
     frame_from_object[:3, 3] = [0.1, -0.2, 0.3]
-    part = carried(bare, scene.views, true_region(), frame_from_object)
-    expected = (2 * GROUND + 0.3) - points[..., 2]
-    assert (least_distance(part, 24) >= expected - 1e-4).all()
+    part = carried(measured, scene.views, true_region(), frame_from_object)
+    part = replace(part, backdrops=[None] * len(scene.views))
+    depth_below = scale * GROUND + 0.3 - node_positions(24, torch.device("cpu"))[..., 2]
+    elsewhere = least_distance(replace(part, ground=None), 24)
+    assert (depth_below > elsewhere + 0.1).any()
+    expected = torch.maximum(depth_below, elsewhere)
+    torch.testing.assert_close(least_distance(part, 24), expected, atol=2e-3, rtol=0)
     assert part.ground is not None
     assert alone.ground is not None
-    assert part.ground.thickness == pytest.approx(2 * alone.ground.thickness)
+    assert part.ground.thickness == pytest.approx(scale * alone.ground.thickness)
 
 
 def test_masks_say_what_the_subject_is(scene: Scene, stereo: StereoResult) -> None:
