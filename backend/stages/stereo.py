@@ -25,6 +25,7 @@ from ..maths.texture import leverage
 from ..scene import DepthMap, Progress, Region, StereoResult, SurfacePoints, View, within
 from .depth_maps import Measured, depth_maps
 from .gaps import without_covered_patches
+from .hanging import without_hanging
 from .outlines_alone import FEWEST_POINTS, check_enough, no_points, outlines_alone
 from .stereo_config import StereoConfig
 from .stereo_windows import neighbours, pyramid, sees_region
@@ -52,7 +53,7 @@ def match_views(
     found = StereoResult(points=points, depth_maps=full_size)
     if len(points.positions) < FEWEST_POINTS:
         return outlines_alone(found)
-    return replace(found, points=without_strays(points))
+    return without_hanging(replace(found, points=without_strays(points)), views, region)
 
 
 def _check_pictures(views: tuple[View, ...]) -> None:
