@@ -42,6 +42,7 @@ class FakeStereo:
     points: SurfacePoints
     refined_cameras: tuple[Camera, ...] | None = None
     beside_lines_px: None = None
+    doubt: None = None
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
