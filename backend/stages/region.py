@@ -95,9 +95,10 @@ def find_region(solved: SolvedCameras, config: RegionConfig, *, progress: Progre
         choice, because = "what all cameras look at", "neither masks nor triangulated points"
     found, alone = _region(centre, radius, choice, because), standing_alone(solved.views)
     if len(alone) >= 2 and (cut_off := share_cut_off(alone, found)) > _CUT_OFF:
-        with suppress(ReconstructionError):  # what each shows may be another thing
-            hull_centre, hull_radius, _ = _of_masks(alone, config)
-            centre, radius = around_both((centre, radius), (hull_centre, hull_radius))
+        # what each shows may be another thing; then finer cells, as `_of_masks` tries, take long for nothing
+        with suppress(ReconstructionError):
+            hull_centre, hull_radius, _ = _of_hull(alone, config)
+            centre, radius = around_both((centre, radius), (hull_centre, hull_radius * config.margin))
             choice += ", and what stands alone before an even backdrop"
             because += f", which leave out {cut_off:.0%} of what {len(alone)} photographs show whole"
             found = _region(centre, radius, choice, because)
