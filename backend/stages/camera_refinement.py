@@ -131,8 +131,7 @@ def match_solved(
         found = replace(found, beside_lines_px=beside_lines_px)
     if not config.without_ground:
         return found
-    progress(1.0, "leaving out the ground")
-    return without_ground(found, with_refined(solved, found).views, region, config)
+    return without_ground(found, with_refined(solved, found).views, region, config, progress=progress)
 
 
 def with_refined(solved: SolvedCameras, stereo: StereoResult) -> SolvedCameras:

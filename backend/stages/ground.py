@@ -27,6 +27,7 @@ from ..scene import (
     Decision,
     DepthMap,
     Ground,
+    Progress,
     Region,
     StereoResult,
     SurfacePoints,
@@ -75,7 +76,12 @@ _EDGE_PX = 1.5
 
 
 def without_ground(
-    stereo: StereoResult, views: tuple[View, ...], region: Region, config: StereoConfig
+    stereo: StereoResult,
+    views: tuple[View, ...],
+    region: Region,
+    config: StereoConfig,
+    *,
+    progress: Progress,
 ) -> StereoResult:
     """Without the points of the ground, whose pixels are empty then; where there is none, with the doubt.
 
@@ -92,12 +98,11 @@ def without_ground(
     kept = {f.name: getattr(points, f.name)[above] for f in fields(points) if f.name != "decisions"}
     windows = [whole_picture(view, region, config) for view in views]
     nearby = neighbours([window.camera for window in windows], _NUM_SOURCES)
-    maps = [
-        _without(
-            ground, map_, view, region, _textured_and_agreeing(ground, window, [windows[n] for n in near])
-        )
-        for map_, view, window, near in zip(stereo.depth_maps, views, windows, nearby, strict=True)
-    ]
+    maps = []
+    for index, (map_, view, near) in enumerate(zip(stereo.depth_maps, views, nearby, strict=True)):
+        progress(1.0, f"ground in photograph {index + 1}")
+        agreeing = _textured_and_agreeing(ground, windows[index], [windows[n] for n in near])
+        maps.append(_without(ground, map_, view, region, agreeing))
     return replace(
         stereo,
         points=replace(points, **kept),

@@ -8,8 +8,9 @@ import torch
 from jaxtyping import Float64
 from scipy.ndimage import binary_dilation
 
+from backend.errors import Cancelled
 from backend.maths.grid import node_positions
-from backend.scene import DepthMap, Ground, StereoResult, SurfacePoints, transform_points
+from backend.scene import DepthMap, Ground, StereoResult, SurfacePoints, no_progress, transform_points
 from backend.stages.ground import find_ground, without_ground
 from backend.stages.measurements import carried, measurements
 from backend.stages.silhouettes import least_distance
@@ -129,7 +130,7 @@ def stereo(scene: Scene) -> StereoResult:
 
 @pytest.fixture(scope="module")
 def alone(scene: Scene, stereo: StereoResult) -> StereoResult:
-    return without_ground(stereo, scene.views, true_region(), StereoConfig())
+    return without_ground(stereo, scene.views, true_region(), StereoConfig(), progress=no_progress)
 
 
 def test_the_ground_is_where_it_is(alone: StereoResult) -> None:
@@ -185,7 +186,7 @@ def test_below_it_nothing_is(scale: float, scene: Scene, alone: StereoResult) ->
 
 def test_masks_say_what_the_subject_is(scene: Scene, stereo: StereoResult) -> None:
     views = tuple(replace(view, mask=np.ones_like(view.image_srgb[..., 0])) for view in scene.views)
-    kept = without_ground(stereo, views, true_region(), StereoConfig())
+    kept = without_ground(stereo, views, true_region(), StereoConfig(), progress=no_progress)
     assert kept.ground is None
     assert kept.doubt is not None
     assert "the photographs have masks" in kept.doubt
@@ -195,10 +196,25 @@ def test_masks_say_what_the_subject_is(scene: Scene, stereo: StereoResult) -> No
 def test_without_ground_nothing_changes_but_the_user_is_told(scene: Scene, stereo: StereoResult) -> None:
     high = stereo.points.positions[:, 2] > GROUND + 0.05
     points = points_at(stereo.points.positions[high].astype(np.float64))
-    kept = without_ground(replace(stereo, points=points), scene.views, true_region(), StereoConfig())
+    kept = without_ground(
+        replace(stereo, points=points), scene.views, true_region(), StereoConfig(), progress=no_progress
+    )
     assert kept.doubt is not None
     assert kept.doubt.startswith("There is no flat ground to leave out: ")
     assert (kept.ground, kept.depth_maps) == (None, stereo.depth_maps)
+
+
+def test_it_can_be_stopped_between_photographs(scene: Scene, stereo: StereoResult) -> None:
+    told: list[str] = []
+
+    def stop_at_the_second(_share: float, text: str) -> None:
+        told.append(text)
+        if len(told) == 2:
+            raise Cancelled
+
+    with pytest.raises(Cancelled):
+        without_ground(stereo, scene.views, true_region(), StereoConfig(), progress=stop_at_the_second)
+    assert told == ["ground in photograph 1", "ground in photograph 2"]
 
 
 def test_height_is_above_the_plane() -> None:
