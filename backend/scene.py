@@ -8,7 +8,7 @@ the subject inside the unit sphere.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -222,6 +222,11 @@ class SurfacePoints:
         for name in ("positions", "normals", "colours_srgb", "confidence"):
             if not np.isfinite(getattr(self, name)).all():
                 raise ValueError(f"{name} of surface points hold numbers that are not finite")
+
+    def chosen(self, which: Bool[np.ndarray, "points"]) -> "SurfacePoints":
+        """Those of the points, with the same decisions."""
+        kept = {f.name: getattr(self, f.name)[which] for f in fields(self) if f.name != "decisions"}
+        return replace(self, **kept)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -6,7 +6,7 @@ for there they agree with each other over the plane, and edges of the picture te
 says what one off a mask says: along its ray there is nothing of the subject.
 """
 
-from dataclasses import fields, replace
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -16,9 +16,9 @@ from scipy.ndimage import (
     binary_erosion,
     distance_transform_edt,
     gaussian_gradient_magnitude,
+    label,
     uniform_filter,
 )
-from skimage.morphology import remove_small_objects
 from skimage.segmentation import watershed
 
 from ..maths.geometry import Pinhole, pinhole_in_object, pixel_centres, ray_directions, unproject
@@ -95,7 +95,6 @@ def without_ground(
         return _as_it_is(stereo, because)
     points = stereo.points
     above = ground.height(points.positions.astype(np.float64)) >= ground.thickness
-    kept = {f.name: getattr(points, f.name)[above] for f in fields(points) if f.name != "decisions"}
     windows = [whole_picture(view, region, config) for view in views]
     nearby = neighbours([window.camera for window in windows], _NUM_SOURCES)
     maps = []
@@ -105,7 +104,7 @@ def without_ground(
         maps.append(_without(ground, map_, view, region, agreeing))
     return replace(
         stereo,
-        points=replace(points, **kept),
+        points=points.chosen(above),
         depth_maps=tuple(maps),
         ground=ground,
         decisions=(*stereo.decisions, Decision(what="ground", choice="left out", because=because)),
@@ -221,4 +220,6 @@ def _up_to_edges(
 
 def _without_specks(mask: Bool[np.ndarray, "height width"], least: float) -> Bool[np.ndarray, "height width"]:
     """Without connected pieces that are a smaller share of the picture."""
-    return np.asarray(remove_small_objects(mask, max_size=round(least * mask.size)))
+    piece, _ = label(mask)
+    large = np.bincount(piece.ravel()) > least * mask.size
+    return np.asarray(large[piece] & mask)

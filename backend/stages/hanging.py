@@ -5,7 +5,7 @@ and where no other photograph shows the same part of the room, some agree by cha
 all around a table 0.3 % of the points were of a few lumps above it.
 """
 
-from dataclasses import fields, replace
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -47,11 +47,10 @@ def without_hanging(stereo: StereoResult, views: tuple[View, ...], region: Regio
     )
     # depth maps may hold more of a piece than points, and no other piece is in a cell beside it
     hangs = binary_dilation(hangs, around)
-    kept = {f.name: getattr(points, f.name)[~hanging] for f in fields(points) if f.name != "decisions"}
     maps = zip(stereo.depth_maps, views, strict=True)
     return replace(
         stereo,
-        points=replace(points, **kept),
+        points=points.chosen(~hanging),
         depth_maps=tuple(_without(map_, view, region, hangs) for map_, view in maps),
         decisions=(*stereo.decisions, decision),
     )

@@ -1,6 +1,6 @@
 """Measured points that lie in no surface with their neighbours, left out where they are many."""
 
-from dataclasses import fields, replace
+from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Bool, Float64
@@ -36,8 +36,7 @@ def without_strays(points: SurfacePoints) -> SurfacePoints:
         because=f"{stray.mean():.0%} of the measured points lie in no surface with those around them: "
         "check the cameras and that the subject did not move",
     )
-    kept = {f.name: getattr(points, f.name)[~stray] for f in fields(points) if f.name != "decisions"}
-    return replace(points, **kept, decisions=(*points.decisions, decision))
+    return replace(points.chosen(~stray), decisions=(*points.decisions, decision))
 
 
 def strays(positions: Float64[np.ndarray, "points 3"]) -> Bool[np.ndarray, "points"]:
