@@ -22,7 +22,7 @@ from .waiting import set_waiting_policy
 from .wire.environment import BUILDS
 from .wire.protocol import DEVICES, PRESETS, PROTOCOL_VERSION, Job
 
-_JOB_OPTIONS = ("output", "cameras", "masks", "preset", "device", "seed", "truth")
+_JOB_OPTIONS = ("output", "cameras", "masks", "preset", "device", "seed", "truth", "without_ground")
 _CAMERA_OPTIONS = ("output", "cameras", "masks", "preset", "seed")
 
 
@@ -71,21 +71,14 @@ def _reconstruct(parser: argparse.ArgumentParser, parsed: argparse.Namespace) ->
         region = {"region_centre": tuple(centre), "region_radius": radius}
     budget = {} if parsed.budget_seconds is None else {"budget_s": parsed.budget_seconds}
     if len(parsed.images) == 1 and parsed.images[0].endswith(".json"):
-        rest = {"region": region, "budget-seconds": budget, "without-ground": parsed.without_ground}
-        options = [*given, *(name for name, value in rest.items() if value)]
+        options = [*given, *(["region"] if region else []), *(["budget-seconds"] if budget else [])]
         if options:
-            parser.error(f"with a job file, {', '.join('--' + name for name in options)} stands in the file")
+            words = ", ".join("--" + name.replace("_", "-") for name in options)
+            parser.error(f"with a job file, {words} stands in the file")
         return on_wire(Path(parsed.images[0]))
     if "output" not in given:
         parser.error("--output is needed")
-    job = Job(
-        protocol=PROTOCOL_VERSION,
-        images=tuple(parsed.images),
-        without_ground=parsed.without_ground,
-        **given,
-        **region,
-        **budget,
-    )
+    job = Job(protocol=PROTOCOL_VERSION, images=tuple(parsed.images), **given, **region, **budget)
     return on_terminal(job, stop_with_stdin=parsed.stop_with_stdin)
 
 
@@ -141,7 +134,12 @@ def _parser() -> argparse.ArgumentParser:
         metavar=("X", "Y", "Z", "RADIUS"),
         help="sphere to reconstruct, in the frame of the cameras; else it is found",
     )
-    add("--without-ground", action="store_true", help="leave out the flat ground that the subject stands on")
+    add(
+        "--without-ground",
+        action="store_true",
+        default=None,  # as of the options above: not asked for
+        help="leave out the flat ground that the subject stands on",
+    )
     add(
         "--budget-seconds",
         type=positive_seconds,

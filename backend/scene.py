@@ -242,6 +242,11 @@ class DepthMap:
     subject: Bool[np.ndarray, "height width"] | None
     """Where something surely stands before that backdrop."""
 
+    def measured_where(self, kept: Bool[np.ndarray, "height width"]) -> "DepthMap":
+        """What was measured there; elsewhere nothing was."""
+        depth, confidence = (np.where(kept, of, np.float32(0)) for of in (self.depth, self.confidence))
+        return replace(self, depth=depth, confidence=confidence)
+
 
 @dataclass(frozen=True, kw_only=True)
 class Ground:

@@ -172,6 +172,21 @@ def faced_points(cameras: list[Camera]) -> SurfacePoints:
     )
 
 
+def plain_points(
+    positions: Points, *, confidence: float = 1.0, view_index: Int64[np.ndarray, "points"] | None = None
+) -> SurfacePoints:
+    """Points of the object frame of which only their places matter; of the first photograph."""
+    count = len(positions)
+    return SurfacePoints(
+        positions=positions.astype(np.float32),
+        normals=np.tile(np.float32([0, 0, 1]), (count, 1)),
+        colours_srgb=np.full((count, 3), 0.5, np.float32),
+        confidence=np.full(count, confidence, np.float32),
+        num_views=np.full(count, 2),
+        view_index=np.zeros(count, np.int64) if view_index is None else view_index,
+    )
+
+
 def camera_at(azimuth_deg: float, height: float, width: int) -> Camera:
     """At DISTANCE, looking at CENTRE; z is up, azimuth 0 is at -y, the height is in SIZE; 4:3."""
     azimuth = np.deg2rad(azimuth_deg)

@@ -92,6 +92,11 @@ def unproject(
     return camera.position + depth[..., None] * ray_directions(camera, pixels)
 
 
+def seen_places(camera: Pinhole, depth: Float[Tensor, "height width"]) -> Float[Tensor, "height width 3"]:
+    """What each pixel of the camera shows at its depth, object frame."""
+    return unproject(camera, pixel_centres(camera.width, camera.height, depth.device), depth)
+
+
 @lru_cache(maxsize=1024)  # the same few pairs are compared at every step; inverting takes a GPU long
 def epipolar_map(source: Pinhole, reference: Pinhole) -> tuple[Float[Tensor, "3 3"], Float[Tensor, "3"]]:
     """(A, b) such that reference pixel u at inverse depth w is seen at A [u 1] + w b, homogeneous."""

@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float, Shaped
 from torch import Tensor
 
 from ..maths.correlation import window_mean, window_sum
-from ..maths.geometry import Pinhole, inside, pixel_centres, project, sample_image, unproject
+from ..maths.geometry import Pinhole, inside, pixel_centres, project, sample_image, seen_places
 from ..maths.inverse_depth import (
     distance_from_edges_px,
     fit_planes,
@@ -334,8 +334,7 @@ def _votes_of(
     there, the two agree by chance; if it has found none, perhaps.
     """
     own = maps[index]
-    pixels = pixel_centres(own.window.camera.width, own.window.camera.height, own.window.grey.device)
-    points = unproject(own.window.camera, pixels, 1 / own.inverse_depth.clamp(min=1e-6))
+    points = seen_places(own.window.camera, 1 / own.inverse_depth.clamp(min=1e-6))
     compared = [
         other
         for other in range(len(maps))

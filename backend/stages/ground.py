@@ -21,7 +21,7 @@ from scipy.ndimage import (
 )
 from skimage.segmentation import watershed
 
-from ..maths.geometry import Pinhole, pinhole_in_object, pixel_centres, ray_directions, unproject
+from ..maths.geometry import Pinhole, pixel_centres, ray_directions, seen_places
 from ..maths.plane_fit import plane_under_most
 from ..scene import (
     Decision,
@@ -48,7 +48,7 @@ _LEAST_SHARE = 0.06
 below a body that fills the pictures, 0.45 of a table, 0.75 of bananas on a rug."""
 _MOST_BELOW = 0.2
 """Points below the ground for each on it: more, and it is a side of the subject. What stands on a box has the
-box's sides below, a seventh of the points of a carton."""
+box's sides below: of a carton one point for seventeen on it."""
 _LEAST_ABOVE = 0.02
 """Of the sure points: less, and there is no subject on it."""
 _SPREADS = 3.0
@@ -101,7 +101,7 @@ def without_ground(
     for index, (map_, view, near) in enumerate(zip(stereo.depth_maps, views, nearby, strict=True)):
         progress(1.0, f"ground in photograph {index + 1}")
         agreeing = _textured_and_agreeing(ground, windows[index], [windows[n] for n in near])
-        maps.append(_without(ground, map_, view, region, agreeing))
+        maps.append(_without(ground, map_, windows[index].camera, view.image_srgb, agreeing))
     return replace(
         stereo,
         points=points.chosen(above),
@@ -160,24 +160,19 @@ def _inverse_depth(ground: Ground, camera: Pinhole) -> Float32[np.ndarray, "heig
 def _without(
     ground: Ground,
     map_: DepthMap,
-    view: View,
-    region: Region,
+    camera: Pinhole,
+    image_srgb: Float32[np.ndarray, "height width 3"],
     textured_and_agreeing: Bool[np.ndarray, "2 height width"],
 ) -> DepthMap:
     """Pixels that show the ground are empty, and those that surely show what stands on it are the subject."""
-    camera = pinhole_in_object(view.camera, region, torch.device("cpu"))
-    pixels = pixel_centres(camera.width, camera.height, torch.device("cpu"))
-    measured = unproject(camera, pixels, torch.from_numpy(map_.depth)).numpy().astype(np.float64)
+    measured = seen_places(camera, torch.from_numpy(map_.depth)).numpy().astype(np.float64)
     low = ground.height(measured) < ground.thickness
     known, sure = map_.depth > 0, map_.confidence > SURE
     standing = _without_specks(known & sure & ~low, _LEAST_STANDING)
     shown = _shown(textured_and_agreeing, known & sure & low, standing)
-    empty = _up_to_edges(shown, standing, view.image_srgb)
-    left = known & ~low & ~empty
+    empty = _up_to_edges(shown, standing, image_srgb)
     return replace(
-        map_,
-        depth=np.where(left, map_.depth, 0).astype(np.float32),
-        confidence=np.where(left, map_.confidence, 0).astype(np.float32),
+        map_.measured_where(~low & ~empty),
         empty=empty if map_.empty is None else empty | map_.empty,
         subject=standing & ~empty if map_.subject is None else (standing | map_.subject) & ~empty,
     )

@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Bool, Float, Int64
 from scipy.ndimage import binary_dilation, generate_binary_structure, label
 
-from ..maths.geometry import pinhole_in_object, pixel_centres, unproject
+from ..maths.geometry import pinhole_in_object, seen_places
 from ..scene import Decision, DepthMap, Region, StereoResult, View
 
 _CELLS = 40
@@ -65,13 +65,5 @@ def _without(
     map_: DepthMap, view: View, region: Region, hangs: Bool[np.ndarray, "cells cells cells"]
 ) -> DepthMap:
     camera = pinhole_in_object(view.camera, region, torch.device("cpu"))
-    pixels = pixel_centres(camera.width, camera.height, torch.device("cpu"))
-    known = map_.depth > 0
-    places = unproject(camera, pixels[known], torch.from_numpy(map_.depth[known])).numpy()
-    kept = known.copy()
-    kept[known] = ~hangs[tuple(_cells(places).T)]
-    return replace(
-        map_,
-        depth=np.where(kept, map_.depth, 0).astype(np.float32),
-        confidence=np.where(kept, map_.confidence, 0).astype(np.float32),
-    )
+    places = seen_places(camera, torch.from_numpy(map_.depth)).numpy()
+    return map_.measured_where(~hangs[tuple(np.moveaxis(_cells(places), -1, 0))])

@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 from ..errors import ErrorCode, ReconstructionError
-from ..scene import Decision, DepthMap, Region, StereoResult, SurfacePoints, View
+from ..scene import Decision, Region, StereoResult, SurfacePoints, View
 
 FEWEST_POINTS = 100
 """With fewer, what agreed did so by chance."""
@@ -77,12 +77,8 @@ def outlines_alone(found: StereoResult) -> StereoResult:
         choice="left out: outlines alone give the shape",
         because=f"the photographs agree on only {len(found.points.positions)} points",
     )
-    maps = tuple(_unmeasured(map_) for map_ in found.depth_maps)
+    maps = tuple(map_.measured_where(np.zeros_like(map_.depth, np.bool_)) for map_ in found.depth_maps)
     return replace(found, points=no_points(), depth_maps=maps, decisions=(*found.decisions, decision))
-
-
-def _unmeasured(map_: DepthMap) -> DepthMap:
-    return replace(map_, depth=np.zeros_like(map_.depth), confidence=np.zeros_like(map_.confidence))
 
 
 def hollows_filled(stereo: StereoResult, region: Region) -> str | None:

@@ -1,7 +1,7 @@
 """What stereo compares: each view's part that shows the region, from full size to small."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -12,7 +12,7 @@ from torch import Tensor
 from ..maths.angles import angles_between
 from ..maths.backdrop import find_backdrop
 from ..maths.correlation import PatchStatistics, patch_statistics, without_local_mean
-from ..maths.geometry import Pinhole, pinhole_in_object, pixel_centres, unproject
+from ..maths.geometry import Pinhole, pinhole_in_object, seen_places
 from ..maths.rays import sphere_span
 from ..scene import Region, View
 from .stereo_config import StereoConfig
@@ -72,20 +72,9 @@ def pyramid(view: View, region: Region, config: StereoConfig, device: torch.devi
     while True:
         is_last = grey.numel() <= config.coarse_pixels or min(grey.shape) < 64
         if pixel_size >= config.first_pixel_size or is_last:
-            flat = without_local_mean(grey, subject.float(), 2 * config.patch_radius)
-            windows.append(
-                Window(
-                    left=left,
-                    top=top,
-                    pixel_size=pixel_size,
-                    camera=camera,
-                    grey=flat,
-                    patches=patch_statistics(flat, subject.float(), config.patch_radius),
-                    noise=noise,
-                    subject=subject,
-                    surrounded=view.mask is None and backdrop is None,
-                )
-            )
+            window = _window(grey, subject, camera, noise, config)
+            surrounded = view.mask is None and backdrop is None
+            windows.append(replace(window, left=left, top=top, pixel_size=pixel_size, surrounded=surrounded))
         if is_last:
             return windows
         pixel_size *= 2
@@ -99,18 +88,30 @@ def pyramid(view: View, region: Region, config: StereoConfig, device: torch.devi
 
 def whole_picture(view: View, region: Region, config: StereoConfig) -> Window:
     """The whole view at its own size as a window, with whatever it shows."""
+    camera = pinhole_in_object(view.camera, region, torch.device("cpu"))
     grey = torch.tensor(view.image_srgb).mean(dim=2)
-    everywhere = torch.ones_like(grey)
-    flat = without_local_mean(grey, everywhere, 2 * config.patch_radius)
+    everywhere = torch.ones_like(grey, dtype=torch.bool)
+    return _window(grey, everywhere, camera, config.noise * _exposure(grey), config)
+
+
+def _window(
+    grey: Float[Tensor, "height width"],
+    subject: Bool[Tensor, "height width"],
+    camera: Pinhole,
+    noise: float,
+    config: StereoConfig,
+) -> Window:
+    """A whole picture at its own size, among surroundings."""
+    flat = without_local_mean(grey, subject.float(), 2 * config.patch_radius)
     return Window(
         left=0,
         top=0,
         pixel_size=1,
-        camera=pinhole_in_object(view.camera, region, torch.device("cpu")),
+        camera=camera,
         grey=flat,
-        patches=patch_statistics(flat, everywhere, config.patch_radius),
-        noise=config.noise * _exposure(grey),
-        subject=everywhere > 0,
+        patches=patch_statistics(flat, subject.float(), config.patch_radius),
+        noise=noise,
+        subject=subject,
         surrounded=True,
     )
 
@@ -123,8 +124,7 @@ def _exposure(grey: Float[Tensor, "height width"]) -> float:
 
 def sees_region(camera: Pinhole) -> Bool[Tensor, "height width"]:
     """Pixels whose ray meets the unit sphere."""
-    pixels = pixel_centres(camera.width, camera.height, camera.intrinsics.device)
-    far = unproject(camera, pixels, torch.ones_like(pixels[..., 0])) - camera.position
+    far = seen_places(camera, camera.intrinsics.new_ones(camera.height, camera.width)) - camera.position
     directions = F.normalize(far, dim=-1).reshape(-1, 3)
     entry, leave = sphere_span(camera.position.expand_as(directions), directions)
     return (leave > entry).reshape(far.shape[:2])

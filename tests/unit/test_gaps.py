@@ -11,7 +11,7 @@ from backend.scene import DepthMap, SurfacePoints, no_progress, transform_points
 from backend.stages.gaps import without_covered_patches
 from backend.stages.stereo import match_views
 from backend.stages.stereo_config import StereoConfig
-from tests.synthetic_scene import Scene, arc_cameras, photographed, true_region
+from tests.synthetic_scene import Scene, arc_cameras, photographed, plain_points, true_region
 
 Patch = Bool[np.ndarray, "120 160"]
 PATCH: Patch = np.hypot(*np.mgrid[-60:60, -80:80]) < 12
@@ -34,20 +34,7 @@ def measured_by_all() -> SurfacePoints:
         world = transform_points(np.linalg.inv(view.camera.camera_from_world), in_camera)
         parts.append((transform_points(true_region().object_from_world, world), np.full(len(world), index)))
     positions, view_index = (np.concatenate(column) for column in zip(*parts, strict=True))
-    any_direction = np.tile(np.array([0, 0, 1], np.float32), (len(positions), 1))
-    return SurfacePoints(
-        positions=positions.astype(np.float32),
-        normals=any_direction,
-        colours_srgb=any_direction,
-        confidence=np.ones(len(positions), np.float32),
-        num_views=np.full(len(positions), 2),
-        view_index=view_index,
-    )
-
-
-def chosen(points: SurfacePoints, which: Bool[np.ndarray, "points"]) -> SurfacePoints:
-    names = ("positions", "normals", "colours_srgb", "confidence", "num_views", "view_index")
-    return replace(points, **{name: getattr(points, name)[which] for name in names})
+    return plain_points(positions, view_index=view_index)
 
 
 def empty_in_first(patch: Patch, points: SurfacePoints) -> Patch:
@@ -75,7 +62,7 @@ def test_where_others_measure_nothing_there_is_a_gap() -> None:
     """Of others, points that fall on the patch are left out, or all of those that are sure."""
     points = measured_by_all()
     of_first = points.view_index == 0
-    alone = chosen(points, of_first)
+    alone = points.chosen(of_first)
     np.testing.assert_array_equal(empty_in_first(PATCH, alone), PATCH)
     unsure = replace(points, confidence=np.where(of_first, 1, 0.29).astype(np.float32))
     np.testing.assert_array_equal(empty_in_first(PATCH, unsure), PATCH)
@@ -88,7 +75,7 @@ def test_a_few_wrong_points_close_no_gap() -> None:
     pixels = transform_points(scene().views[0].camera.camera_from_world, world)
     pixels = pixels @ scene().views[0].camera.intrinsics.T
     column, row = (pixels[:, :2] / pixels[:, 2:]).astype(int).clip(0, [159, 119]).T
-    np.testing.assert_array_equal(empty_in_first(PATCH, chosen(points, few | ~PATCH[row, column])), PATCH)
+    np.testing.assert_array_equal(empty_in_first(PATCH, points.chosen(few | ~PATCH[row, column])), PATCH)
 
 
 def test_points_beside_a_narrow_gap_do_not_close_it() -> None:

@@ -10,7 +10,8 @@ from scipy.ndimage import binary_dilation
 
 from backend.errors import Cancelled
 from backend.maths.grid import node_positions
-from backend.scene import DepthMap, Ground, StereoResult, SurfacePoints, no_progress, transform_points
+from backend.maths.raycast import camera_rays
+from backend.scene import DepthMap, Ground, StereoResult, no_progress, transform_points
 from backend.stages.ground import find_ground, without_ground
 from backend.stages.measurements import carried, measurements
 from backend.stages.silhouettes import least_distance
@@ -23,25 +24,13 @@ from tests.synthetic_scene import (
     camera_at,
     ground_distance,
     photographed,
-    texture_srgb,
+    plain_points,
     true_region,
 )
 
 EYES = np.array([[-0.5, -2.0, 1.5], [0.5, -2.0, 1.5]])
 GROUND = (GROUND_Z - CENTRE[2]) / OBJECT_UNIT
 """Its height in the object frame, whose axes are the world's."""
-
-
-def points_at(positions: Float64[np.ndarray, "points 3"], confidence: float = 1.0) -> SurfacePoints:
-    num = len(positions)
-    return SurfacePoints(
-        positions=positions.astype(np.float32),
-        normals=np.tile(np.float32([0, 0, 1]), (num, 1)),
-        colours_srgb=np.full((num, 3), 0.5, np.float32),
-        confidence=np.full(num, confidence, np.float32),
-        num_views=np.full(num, 2),
-        view_index=np.zeros(num, np.int64),
-    )
 
 
 def disc(z: float, num: int = 3000, noise: float = 0.002) -> Float64[np.ndarray, "points 3"]:
@@ -56,7 +45,7 @@ def ball(z: float, num: int = 1000) -> Float64[np.ndarray, "points 3"]:
 
 
 def test_a_plane_with_something_on_it_is_ground() -> None:
-    points = points_at(np.concatenate([disc(-0.2), ball(0.1)]))
+    points = plain_points(np.concatenate([disc(-0.2), ball(0.1)]))
     for eyes in (EYES, EYES[::-1]):
         ground, because = find_ground(points, eyes)
         assert ground is not None
@@ -78,12 +67,12 @@ def test_a_plane_with_something_on_it_is_ground() -> None:
     ],
 )
 def test_what_is_no_ground(positions: Float64[np.ndarray, "points 3"]) -> None:
-    assert find_ground(points_at(positions), EYES)[0] is None
+    assert find_ground(plain_points(positions), EYES)[0] is None
 
 
 def test_unsure_points_tell_no_ground() -> None:
     positions = np.concatenate([disc(-0.2), ball(0.1)])
-    assert find_ground(points_at(positions, confidence=0.1), EYES)[0] is None
+    assert find_ground(plain_points(positions, confidence=0.1), EYES)[0] is None
 
 
 @pytest.fixture(scope="module")
@@ -98,33 +87,20 @@ def stereo(scene: Scene) -> StereoResult:
     """All that is in the region is measured truly, but for what lies within 4 px of the body's outline."""
     maps, positions, views = [], [], []
     for index, (view, depth) in enumerate(zip(scene.views, scene.depths, strict=True)):
-        height, width = depth.shape
-        rows, columns = np.mgrid[0:height, 0:width] + 0.5
-        camera = view.camera
-        across = np.stack(
-            [
-                (columns - camera.cx_px) / camera.fx_px,
-                (rows - camera.cy_px) / camera.fy_px,
-                np.ones(depth.shape),
-            ],
-            axis=-1,
-        ).reshape(-1, 3)
-        directions = across @ camera.camera_from_world[:3, :3]
-        to_ground = ground_distance(np.tile(camera.position, (len(across), 1)), directions)
-        shown = np.minimum(depth.ravel(), to_ground)
-        world = camera.position + np.where(np.isfinite(shown), shown, 0)[:, None] * directions
-        inside = np.linalg.norm(transform_points(true_region().object_from_world, world), axis=1) < 1
+        origins, directions = camera_rays(view.camera)
+        along_axis = directions @ view.camera.camera_from_world[2, :3]
+        shown = np.minimum(depth.ravel(), ground_distance(origins, directions) * along_axis)
+        met = np.isfinite(shown)
+        world = origins + np.where(met, shown / along_axis, 0)[:, None] * directions
+        places = transform_points(true_region().object_from_world, world)
         body = np.isfinite(depth)
         unknown = binary_dilation(body, iterations=4) & binary_dilation(~body, iterations=4)
-        known = (np.isfinite(shown) & inside).reshape(depth.shape) & ~unknown
+        known = (met & (np.linalg.norm(places, axis=1) < 1)).reshape(depth.shape) & ~unknown
         measured = np.where(known, shown.reshape(depth.shape) / OBJECT_UNIT, 0).astype(np.float32)
         maps.append(DepthMap(depth=measured, confidence=known.astype(np.float32), empty=None, subject=None))
-        positions.append(world[known.ravel()][::10])
+        positions.append(places[known.ravel()][::10])
         views.append(np.full(len(positions[-1]), index))
-    world = np.concatenate(positions)
-    points = points_at(transform_points(true_region().object_from_world, world))
-    colours = texture_srgb(world).astype(np.float32)
-    points = replace(points, colours_srgb=colours, view_index=np.concatenate(views))
+    points = plain_points(np.concatenate(positions), view_index=np.concatenate(views))
     return StereoResult(points=points, depth_maps=tuple(maps))
 
 
@@ -195,7 +171,7 @@ def test_masks_say_what_the_subject_is(scene: Scene, stereo: StereoResult) -> No
 
 def test_without_ground_nothing_changes_but_the_user_is_told(scene: Scene, stereo: StereoResult) -> None:
     high = stereo.points.positions[:, 2] > GROUND + 0.05
-    points = points_at(stereo.points.positions[high].astype(np.float64))
+    points = plain_points(stereo.points.positions[high].astype(np.float64))
     kept = without_ground(
         replace(stereo, points=points), scene.views, true_region(), StereoConfig(), progress=no_progress
     )

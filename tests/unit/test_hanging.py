@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 from jaxtyping import Float64
 
-from backend.scene import Camera, DepthMap, Region, StereoResult, SurfacePoints, View
+from backend.scene import Camera, DepthMap, Region, StereoResult, View
 from backend.stages.hanging import without_hanging
+from tests.synthetic_scene import plain_points
 
 REGION = Region(object_from_world=np.diag([0.5, 0.5, 0.5, 1.0]))
 """Two world units around the origin."""
@@ -21,18 +22,6 @@ def table(z: float = -0.5, num: int = 20_000) -> Float64[np.ndarray, "points 3"]
 
 def lump(x: float, num: int = 40) -> Float64[np.ndarray, "points 3"]:
     return np.random.default_rng(1).normal(size=(num, 3)) * 0.01 + [x, 0, 0.3]
-
-
-def points_at(positions: Float64[np.ndarray, "points 3"]) -> SurfacePoints:
-    num = len(positions)
-    return SurfacePoints(
-        positions=positions.astype(np.float32),
-        normals=np.tile(np.float32([0, 0, 1]), (num, 1)),
-        colours_srgb=np.full((num, 3), 0.5, np.float32),
-        confidence=np.full(num, 0.5, np.float32),
-        num_views=np.full(num, 2),
-        view_index=np.zeros(num, np.int64),
-    )
 
 
 def view(masked: bool = False) -> View:
@@ -58,7 +47,7 @@ def stereo_of(positions: Float64[np.ndarray, "points 3"]) -> StereoResult:
     depth[18:22, 18:22] = 4.0 - 0.3
     depth[:5] = 0
     map_ = DepthMap(depth=depth, confidence=np.where(depth > 0, np.float32(0.5), 0), empty=None, subject=None)
-    return StereoResult(points=points_at(positions), depth_maps=(map_,))
+    return StereoResult(points=plain_points(positions, confidence=0.5), depth_maps=(map_,))
 
 
 def test_lumps_above_a_table_are_left_out() -> None:
