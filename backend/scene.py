@@ -241,6 +241,9 @@ class DepthMap:
     """Where the photograph, if it has no mask, shows nothing but an even backdrop; None where it has none."""
     subject: Bool[np.ndarray, "height width"] | None
     """Where something surely stands before that backdrop."""
+    behind: Bool[np.ndarray, "height width"] | None = None
+    """Where patches agree better behind the region than anywhere in it; None where a mask or an even backdrop
+    tells what is not the subject."""
 
     def measured_where(self, kept: Bool[np.ndarray, "height width"]) -> "DepthMap":
         """What was measured there; elsewhere nothing was."""

@@ -3,7 +3,8 @@
 A table or a rug is measured like all else, and without masks nothing tells it from the subject but this: most
 of it lies on a plane, and nothing lies below. Once the plane is known, photographs tell which pixels show it,
 for there they agree with each other over the plane, and edges of the picture tell where it ends. Such a pixel
-says what one off a mask says: along its ray there is nothing of the subject.
+says what one off a mask says: along its ray there is nothing of the subject. So does one that shows what
+lies behind the region, as stereo found.
 """
 
 from dataclasses import replace
@@ -65,8 +66,10 @@ _AROUND_PX, _TEXTURED_SHARE, _AGREEING_SHARE = 15, 0.05, 0.65
 that must agree. A pile rug agrees on three quarters and more, what stands before it on a tenth, by chance."""
 _GAP_PX = 3
 """Gaps up to twice as wide between pixels that show the ground show it too."""
-_LEAST_SHOWN, _LEAST_STANDING = 1e-3, 2e-4
-"""Of the picture: smaller pieces of ground, and of what stands on it, are chance."""
+_BEHIND_INSIDE_PX = 2
+"""From the border of what shows the room behind, which is found where photographs are small."""
+_LEAST_SHOWN, _LEAST_STANDING, _LEAST_BEHIND = 1e-3, 2e-4, 5e-3
+"""Of the picture: smaller pieces of ground, of what stands on it, and of the room behind are chance."""
 _INSIDE_PX, _OUTSIDE_PX = 4, 6
 """From the border of what agrees: so far inside pixels surely show the ground, and so far outside they are
 not known to, for a patch that reaches over the subject's outline agrees or not by chance. Between them the
@@ -101,7 +104,8 @@ def without_ground(
     for index, (map_, view, near) in enumerate(zip(stereo.depth_maps, views, nearby, strict=True)):
         progress(1.0, f"ground in photograph {index + 1}")
         agreeing = _textured_and_agreeing(ground, windows[index], [windows[n] for n in near])
-        maps.append(_without(ground, map_, windows[index].camera, view.image_srgb, agreeing))
+        behind = _textured_and_behind(map_, windows[index])
+        maps.append(_without(ground, map_, windows[index].camera, view.image_srgb, agreeing, behind))
     return replace(
         stereo,
         points=points.chosen(above),
@@ -149,6 +153,12 @@ def _textured_and_agreeing(
     return np.stack([asked.numpy(), (asked & (score > _AGREES)).numpy()])
 
 
+def _textured_and_behind(map_: DepthMap, window: Window) -> Bool[np.ndarray, "2 height width"]:
+    """Where the picture has texture, and where that is found again behind the region."""
+    textured = window.textured.numpy()
+    return np.stack([textured, textured & (False if map_.behind is None else map_.behind)])
+
+
 def _inverse_depth(ground: Ground, camera: Pinhole) -> Float32[np.ndarray, "height width"]:
     """Of the ground along each pixel's ray; not positive where that does not meet it."""
     pixels = pixel_centres(camera.width, camera.height, torch.device("cpu"))
@@ -163,14 +173,19 @@ def _without(
     camera: Pinhole,
     image_srgb: Float32[np.ndarray, "height width 3"],
     textured_and_agreeing: Bool[np.ndarray, "2 height width"],
+    textured_and_behind: Bool[np.ndarray, "2 height width"],
 ) -> DepthMap:
-    """Pixels that show the ground are empty, and those that surely show what stands on it are the subject."""
+    """Pixels that show the ground or the room behind are empty, those that surely show what stands there are
+    the subject."""
     measured = seen_places(camera, torch.from_numpy(map_.depth)).numpy().astype(np.float64)
     low = ground.height(measured) < ground.thickness
     known, sure = map_.depth > 0, map_.confidence > SURE
     standing = _without_specks(known & sure & ~low, _LEAST_STANDING)
-    shown = _shown(textured_and_agreeing, known & sure & low, standing)
-    empty = _up_to_edges(shown, standing, image_srgb)
+    ground_shown = _most_agree(textured_and_agreeing, standing) | (known & sure & low)
+    behind = _without_specks(_most_agree(textured_and_behind, standing), _LEAST_BEHIND)
+    behind = binary_erosion(behind, iterations=_BEHIND_INSIDE_PX, border_value=1)
+    closed = binary_closing(ground_shown | behind, iterations=_GAP_PX)
+    empty = _up_to_edges(_without_specks(closed & ~standing, _LEAST_SHOWN), standing, image_srgb)
     return replace(
         map_.measured_where(~low & ~empty),
         empty=empty if map_.empty is None else empty | map_.empty,
@@ -178,18 +193,17 @@ def _without(
     )
 
 
-def _shown(
-    textured_and_agreeing: Bool[np.ndarray, "2 height width"],
-    low: Bool[np.ndarray, "height width"],
-    standing: Bool[np.ndarray, "height width"],
+def _most_agree(
+    textured_and_agreeing: Bool[np.ndarray, "2 height width"], standing: Bool[np.ndarray, "height width"]
 ) -> Bool[np.ndarray, "height width"]:
-    """What shows the ground, to the size of a patch: most around agrees, or stereo measured it there."""
+    """Where most of what has texture around a pixel agrees: that tells to the size of a patch."""
     textured, agreeing = (
         uniform_filter((where & ~standing).astype(np.float32), _AROUND_PX) for where in textured_and_agreeing
     )
-    most_agrees = (textured > _TEXTURED_SHARE) & (agreeing > _AGREEING_SHARE * textured)
-    closed = binary_closing(most_agrees | low, iterations=_GAP_PX)
-    return _without_specks(closed & ~standing, _LEAST_SHOWN)
+    most: Bool[np.ndarray, "height width"] = (textured > _TEXTURED_SHARE) & (
+        agreeing > _AGREEING_SHARE * textured
+    )
+    return most
 
 
 def _up_to_edges(
@@ -197,9 +211,9 @@ def _up_to_edges(
     standing: Bool[np.ndarray, "height width"],
     image_srgb: Float32[np.ndarray, "height width 3"],
 ) -> Bool[np.ndarray, "height width"]:
-    """The same up to the strongest edge of the picture near its border.
+    """What shows the ground or the room behind, up to the strongest edge of the picture near its border.
 
-    By watershed from what is surely ground and what is not known to be (Meyer, "Topographic distance and
+    By watershed from what surely does and what is not known to (Meyer, "Topographic distance and
     watershed lines", 1994).
     """
     inside = binary_erosion(shown, iterations=_INSIDE_PX, border_value=1)

@@ -27,9 +27,13 @@ from .depth_maps import Measured, depth_maps
 from .gaps import without_covered_patches
 from .hanging import without_hanging
 from .outlines_alone import FEWEST_POINTS, check_enough, no_points, outlines_alone
+from .plane_sweep import AGREES_BETTER
 from .stereo_config import StereoConfig
 from .stereo_windows import neighbours, pyramid, sees_region
 from .strays import without_strays
+
+_LEAST_BEHIND = 0.5
+"""Correlation of patches behind the region from which on a pixel may show what is there."""
 
 
 def match_views(
@@ -146,7 +150,8 @@ def _every(stride: int, mask: Bool[Tensor, "height width"]) -> Bool[Tensor, "hei
 
 def _full_size(view: View, maps: list[Measured], region: Region, config: StereoConfig) -> DepthMap:
     """What was measured at any size, over the whole photograph."""
-    window = maps[0].map.window
+    finest = maps[0].map
+    window = finest.window
     width, height = (side * window.pixel_size for side in (window.camera.width, window.camera.height))
     pixels = pixel_centres(width, height, window.grey.device)
     inverse_depth, confidence = torch.ones_like(pixels[..., 0]), torch.zeros_like(pixels[..., 0])
@@ -161,14 +166,19 @@ def _full_size(view: View, maps: list[Measured], region: Region, config: StereoC
         colours = torch.tensor(view.image_srgb, device=window.grey.device).permute(2, 0, 1)
         seen = sees_region(pinhole_in_object(view.camera, region, window.grey.device))
         backdrop = find_backdrop(colours, seen)
-    whole = np.zeros((2, view.camera.height, view.camera.width), np.float32)
-    known = torch.stack([torch.where(confidence > 0, 1 / inverse_depth.clamp(min=1e-6), 0.0), confidence])
+    agrees_behind = finest.behind > (finest.score + AGREES_BETTER).clamp(min=_LEAST_BEHIND)
+    at = (pixels / window.pixel_size)[None]
+    behind = sample_image(agrees_behind[None].float(), at, mode="nearest")[0, 0]
+    whole = np.zeros((3, view.camera.height, view.camera.width), np.float32)
+    depth = torch.where(confidence > 0, 1 / inverse_depth.clamp(min=1e-6), 0.0)
+    known = torch.stack([depth, confidence, behind])
     whole[:, window.top : window.top + height, window.left : window.left + width] = known.cpu().numpy()
-    depth, confidence_map = whole
+    depth_map, confidence_map, behind_map = whole
     return DepthMap(
-        depth=depth,
+        depth=depth_map,
         confidence=confidence_map,
         # a shadow may be as dark as the backdrop: what was measured is not empty
-        empty=None if backdrop is None else backdrop.empty.cpu().numpy() & (depth == 0),
+        empty=None if backdrop is None else backdrop.empty.cpu().numpy() & (depth_map == 0),
         subject=None if backdrop is None else backdrop.subject.cpu().numpy(),
+        behind=behind_map > 0 if window.surrounded else None,
     )

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 from jaxtyping import Float64
-from scipy.ndimage import binary_dilation
+from scipy.ndimage import binary_dilation, binary_erosion
 
 from backend.errors import Cancelled
 from backend.maths.grid import node_positions
@@ -140,6 +140,31 @@ def test_pixels_that_show_it_are_empty_up_to_the_subject_s_outline(scene: Scene,
         assert not (map_.empty & map_.subject).any()
         assert not map_.depth[map_.empty].any()
         assert not map_.confidence[map_.empty].any()
+
+
+def test_pixels_that_show_the_room_behind_are_empty_too(scene: Scene, stereo: StereoResult) -> None:
+    """What of it has texture; a piece of the subject that is found again behind by chance stays."""
+    maps, rooms, chances = [], [], []
+    for view, body, map_ in zip(scene.views, scene.coverage, stereo.depth_maps, strict=True):
+        on_ground = np.isfinite(ground_distance(*camera_rays(view.camera))).reshape(body.shape)
+        rooms.append(~body & ~on_ground)
+        row, column = np.argwhere(body).mean(axis=0).astype(int)
+        chance = np.zeros_like(body)
+        chance[row - 10 : row + 10, column - 10 : column + 10] = True
+        measured = map_.measured_where(~binary_dilation(chance, iterations=2))
+        chances.append(chance)
+        maps.append(replace(measured, behind=binary_erosion(rooms[-1]) | chances[-1]))
+    told = replace(stereo, depth_maps=tuple(maps))
+    alone = without_ground(told, scene.views, true_region(), StereoConfig(), progress=no_progress)
+    untold = without_ground(stereo, scene.views, true_region(), StereoConfig(), progress=no_progress)
+    for room, body, chance, map_, before in zip(
+        rooms, scene.coverage, chances, alone.depth_maps, untold.depth_maps, strict=True
+    ):
+        assert map_.empty is not None
+        assert before.empty is not None
+        assert (map_.empty & body).sum() < 0.01 * body.sum()
+        assert not (map_.empty & chance).any()
+        assert (map_.empty & room).sum() > 0.45 * room.sum() > 3 * (before.empty & room).sum()
 
 
 @pytest.mark.parametrize("scale", [1.0, 1.5])

@@ -380,6 +380,19 @@ def test_what_stands_behind_the_region_does_not_hang_in_it() -> None:
     assert (errors < 1).sum() > 30_500
 
 
+def test_pixels_that_show_what_is_behind_the_region_are_told() -> None:
+    """Where nothing else tells what is not the subject: no mask, and no even backdrop."""
+    scene = photographed(arc_cameras(4, 60, 160), wall=True)
+    for map_, body in zip(match(scene.without_masks().views).depth_maps, scene.coverage, strict=True):
+        assert map_.behind is not None
+        assert (map_.behind & body).sum() < 0.025 * body.sum()
+        assert (map_.behind & ~body).sum() > 3 * (map_.behind & body).sum()
+        assert (map_.behind & ~body).sum() > 0.05 * (~body).sum()
+    assert [map_.behind for map_ in match(scene.views).depth_maps] == [None] * 4
+    before_black = photographed(arc_cameras(3, 40, 160)).without_masks()
+    assert [map_.behind for map_ in match(before_black.views).depth_maps] == [None] * 3
+
+
 def test_from_within_the_region_a_step_may_lead_beyond_all_that_moves() -> None:
     """Sixteen steps from near to far are so long there that none is left behind: no error."""
     wide = np.eye(4)
