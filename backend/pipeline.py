@@ -26,13 +26,14 @@ from .previews import Previews
 from .provenance import code_fingerprint, versions
 from .results import cameras_summary, check_no_mesh_of_others, summary, write_all, write_cameras
 from .scene import Decision, Photo, Region, SolvedCameras, StereoResult, SurfaceMesh, View
-from .stages.camera_refinement import match_solved, with_refined
+from .stages.camera_refinement import with_refined
 from .stages.camera_report import build_camera_report
 from .stages.cameras import solve_cameras
 from .stages.confirmation import unconfirmed
 from .stages.copies import copies_apart_text
 from .stages.disagreement import disagreement
 from .stages.known_cameras import cameras_source, may_be_unturned
+from .stages.matching import match_solved
 from .stages.mesh import extract_mesh
 from .stages.neus_fit import NeusConfig, fit_neus
 from .stages.originals import Original

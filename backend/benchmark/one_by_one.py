@@ -13,8 +13,9 @@ import torch
 from ..pipeline import fit_by_settings
 from ..presets import Settings
 from ..scene import Region, SolvedCameras, StereoResult, SurfaceMesh, View, no_progress
-from ..stages.camera_refinement import match_solved, with_refined
+from ..stages.camera_refinement import with_refined
 from ..stages.cameras import CamerasConfig, solve_cameras
+from ..stages.matching import match_solved
 from ..stages.mesh import extract_mesh
 from ..stages.photos import PhotosConfig, load_photos
 from ..stages.region import find_region

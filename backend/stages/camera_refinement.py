@@ -8,7 +8,6 @@ cameras adjusted to the patches, and stereo done again.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 import PIL.Image  # noqa: F401 - pycolmap loaded before Pillow corrupts memory when Pillow next saves
@@ -24,7 +23,6 @@ from ..maths.projection import projected
 from ..scene import (
     Camera,
     Decision,
-    Progress,
     Region,
     SolvedCameras,
     StereoResult,
@@ -33,10 +31,7 @@ from ..scene import (
     transform_points,
 )
 from .bundle_adjustment import adjust_bundle
-from .ground import without_ground
 from .lenses import rigid_matrix
-from .stereo import match_views, unmatched
-from .stereo_config import StereoConfig
 from .stereo_windows import neighbours
 
 _WHAT = "estimated cameras, held against the surface"
@@ -97,41 +92,6 @@ class Refined:
     cameras: tuple[Camera, ...] | None
     """None where they are to stay as they are."""
     decision: Decision
-
-
-def match_solved(
-    solved: SolvedCameras,
-    region: Region,
-    config: StereoConfig | None,
-    *,
-    device: torch.device,
-    progress: Progress,
-) -> StereoResult:
-    """Stereo of the photographs; where their cameras were estimated and turn out to be off, once more.
-
-    Given cameras are taken at their word, but held against the surface as well. Without a config nothing is
-    compared: what is fitted does not ask.
-    Raises what `match_views` does.
-    """
-    if config is None:
-        return unmatched(solved.views)
-    work = partial(match_views, region=region, config=config, device=device)
-    found = work(solved.views, progress=progress)
-    if solved.estimated:
-        refined = refine_cameras(solved.views, region, found.points, device=device)
-        if refined.cameras is not None:
-            views = with_cameras(solved.views, refined.cameras)
-            found = work(views, progress=lambda share, text: progress(share, f"{text}, again"))
-        decisions = (*found.decisions, refined.decision)
-        found = replace(found, refined_cameras=refined.cameras, decisions=decisions)
-    else:
-        with torch.no_grad():
-            seen = find_patches(solved.views, region, found.points, device=device)
-        beside_lines_px = misplaced_px([view.camera for view in solved.views], seen)
-        found = replace(found, beside_lines_px=beside_lines_px)
-    if not config.without_ground:
-        return found
-    return without_ground(found, with_refined(solved, found).views, region, config, progress=progress)
 
 
 def with_refined(solved: SolvedCameras, stereo: StereoResult) -> SolvedCameras:

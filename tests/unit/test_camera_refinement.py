@@ -11,17 +11,17 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from backend.scene import Camera, StereoResult, SurfacePoints, View, no_progress, transform_points
-from backend.stages import camera_refinement
+from backend.stages import camera_refinement, matching
 from backend.stages.camera_refinement import (
     Sightings,
     find_patches,
     largest_move_px,
-    match_solved,
     misplaced_px,
     refine_cameras,
     with_cameras,
     with_refined,
 )
+from backend.stages.matching import match_solved
 from backend.stages.stereo_config import StereoConfig
 from tests.relative_rotations import rotation_errors_deg
 from tests.synthetic_scene import (
@@ -232,9 +232,9 @@ def counting_stereo(seen: list[tuple[View, ...]]) -> Callable[..., StereoResult]
 def test_stereo_is_done_again_where_cameras_were_refined_alone(
     estimated: bool, size_px: float, num_runs: int, num_decisions: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Given cameras are not even looked at."""
+    """With given cameras it is done once, whatever they are."""
     runs: list[tuple[View, ...]] = []
-    monkeypatch.setattr(camera_refinement, "match_views", counting_stereo(runs))
+    monkeypatch.setattr(matching, "match_views", counting_stereo(runs))
     views = with_cameras(scene().views, jittered(scene().cameras, size_px))
     solved = replace(scene().solved(), views=views, estimated=estimated)
     result = match_solved(solved, true_region(), StereoConfig(), device=CPU, progress=no_progress)

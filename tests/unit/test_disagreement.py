@@ -8,8 +8,8 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from backend.scene import Camera, SolvedCameras, StereoResult, no_progress
-from backend.stages.camera_refinement import match_solved
 from backend.stages.disagreement import disagreement, outlines_of_masks_miss_px
+from backend.stages.matching import match_solved
 from backend.stages.stereo_config import StereoConfig
 from tests.synthetic_scene import CENTRE, Scene, arc_cameras, photographed, true_region
 
