@@ -70,7 +70,7 @@ PRESETS = MappingProxyType(
         "detailed": Settings(
             photos=PhotosConfig(max_side_px=1600),
             train=TrainConfig(
-                levels=(32, 64, 128, 192), rounds=(15, 15, 10, 10), steps=(0, 0, 0, 200), detail=320
+                levels=(32, 64, 128, 192), rounds=(15, 15, 10, 10), steps=(0, 0, 0, 0), detail=320
             ),
             mesh=MeshConfig(max_faces=200_000, texture=TextureConfig(max_photo_px=4096, max_side_px=8192)),
         ),
