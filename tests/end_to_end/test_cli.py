@@ -677,27 +677,21 @@ def test_the_callers_death_ends_the_run_within_two_seconds(case: Case, trouble: 
 def seconds_after_the_callers_death(case: Case, trouble: str) -> float:
     """How long the run goes on."""
     command = [*case.command(trouble, "cameras", 0.05), str(case.write_job())]
-    (case.folder / "done").unlink(missing_ok=True)  # of an earlier run
-    process = subprocess.Popen(
-        command,
-        env=case.environment,
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.DEVNULL,
-    )
-    try:
-        case.wait_for_stage("cameras")
-        time.sleep(0.4)
-        assert process.stdin is not None
-        assert process.stdout is not None
-        process.stdout.close()
-        process.stdin.close()
-        began = time.monotonic()
-        assert process.wait(30.0) == 130
-        return time.monotonic() - began
-    finally:
-        process.kill()
-        process.wait()
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.DEVNULL}
+    case.done()  # what an earlier run noted is not waited for
+    with subprocess.Popen(command, env=case.environment, **pipes) as process:
+        try:
+            case.wait_for_stage("cameras")
+            time.sleep(0.4)
+            assert process.stdin is not None
+            assert process.stdout is not None
+            process.stdout.close()
+            process.stdin.close()
+            began = time.monotonic()
+            assert process.wait(30.0) == 130
+            return time.monotonic() - began
+        finally:
+            process.kill()
 
 
 @pytest.mark.slow
