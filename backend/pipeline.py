@@ -26,18 +26,13 @@ from .previews import Previews
 from .provenance import code_fingerprint, versions
 from .results import cameras_summary, check_no_mesh_of_others, summary, write_all, write_cameras
 from .scene import Decision, Photo, Region, SolvedCameras, StereoResult, SurfaceMesh, View
-from .stages.camera_refinement import with_refined
-from .stages.camera_report import build_camera_report
-from .stages.cameras import solve_cameras
-from .stages.confirmation import unconfirmed
-from .stages.copies import copies_apart_text
-from .stages.disagreement import disagreement
-from .stages.known_cameras import cameras_source, may_be_unturned
-from .stages.matching import match_solved
-from .stages.mesh import extract_mesh
-from .stages.neus_fit import NeusConfig, fit_neus
-from .stages.originals import Original
-from .stages.outlines_alone import hollows_filled
+from .stages.cameras.camera_report import build_camera_report
+from .stages.cameras.confirmation import unconfirmed
+from .stages.cameras.copies import copies_apart_text
+from .stages.cameras.known_cameras import cameras_source, may_be_unturned
+from .stages.cameras.solving import solve_cameras
+from .stages.mesh.extraction import extract_mesh
+from .stages.mesh.originals import Original
 from .stages.photos import (
     load_photos,
     match_masks,
@@ -47,12 +42,17 @@ from .stages.photos import (
     white_masks_text,
     without_masks_text,
 )
-from .stages.radiance_field import Radiance
-from .stages.radiance_fit import RadianceConfig, fit_radiance
+from .stages.published.neus_fit import NeusConfig, fit_neus
+from .stages.published.radiance_fit import RadianceConfig, fit_radiance
+from .stages.radiance import Radiance
 from .stages.region import find_region
 from .stages.report import Report, ReportInputs, StageTiming, build_report
+from .stages.stereo.camera_refinement import with_refined
+from .stages.stereo.disagreement import disagreement
+from .stages.stereo.matching import match_solved
+from .stages.stereo.outlines_alone import hollows_filled
 from .stages.surface import Surface
-from .stages.train import TrainConfig, fit_surface
+from .stages.train.surface_fit import TrainConfig, fit_surface
 from .wire.photographs import passed_over, passed_over_text
 from .workspace import StageCost, Workspace, check_free_space, content_of, fingerprint
 

@@ -4,19 +4,19 @@ import math
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 
-from .stages.cameras import CamerasConfig
-from .stages.linear_fit import LinearConfig
-from .stages.mesh import MeshConfig
-from .stages.networks import HashConfig, NetworkConfig
-from .stages.neus_fit import NeusConfig
-from .stages.neus_losses import Sampling, Weights
+from .stages.cameras.solving import CamerasConfig
+from .stages.mesh.extraction import MeshConfig
+from .stages.mesh.texture import TextureConfig
 from .stages.photos import PhotosConfig
-from .stages.radiance_fit import RadianceConfig
+from .stages.published.networks import HashConfig, NetworkConfig
+from .stages.published.neus_fit import NeusConfig
+from .stages.published.neus_losses import Sampling, Weights
+from .stages.published.radiance_fit import RadianceConfig
 from .stages.region import RegionConfig
 from .stages.report import ReportConfig
-from .stages.stereo_config import StereoConfig
-from .stages.texture import TextureConfig
-from .stages.train import TrainConfig
+from .stages.stereo.config import StereoConfig
+from .stages.train.linear_fit import LinearConfig
+from .stages.train.surface_fit import TrainConfig
 
 
 @dataclass(frozen=True, kw_only=True)

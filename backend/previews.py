@@ -11,8 +11,8 @@ import numpy as np
 
 from .mesh_files import write_mesh, write_points
 from .scene import Region, SolvedCameras, SurfacePoints, transform_points
-from .stages.mesh import preview_mesh
-from .stages.nerfstudio import transforms_json
+from .stages.cameras.nerfstudio import transforms_json
+from .stages.mesh.extraction import preview_mesh
 from .stages.surface import Surface
 from .workspace import Workspace
 

@@ -17,10 +17,11 @@ from .mesh_files import read_mesh
 from .records import load_record
 from .results import RADIANCE, Writers
 from .scene import Camera, Progress, within
-from .stages.known_cameras import read_cameras
-from .stages.nerfstudio import CAMERAS
-from .stages.radiance_field import Radiance, restored
-from .stages.radiance_image import RadianceImage, radiance_image
+from .stages.cameras.known_cameras import read_cameras
+from .stages.cameras.nerfstudio import CAMERAS
+from .stages.published.radiance_field import restored
+from .stages.published.radiance_image import RadianceImage, radiance_image
+from .stages.radiance import Radiance
 from .wire.protocol import is_path
 from .workspace import open_workspace
 

@@ -10,9 +10,9 @@ from .maths.sampling import mean_colours
 from .mesh_files import SPARSE, TEXTURE, png_of, write_glb, write_mesh, write_points, write_sparse
 from .records import save_record
 from .scene import Region, SolvedCameras
-from .stages.camera_report import CameraReport, camera_report_html, camera_report_numbers
-from .stages.nerfstudio import CAMERAS, transforms_json
-from .stages.radiance_field import Radiance
+from .stages.cameras.camera_report import CameraReport, camera_report_html, camera_report_numbers
+from .stages.cameras.nerfstudio import CAMERAS, transforms_json
+from .stages.radiance import Radiance
 from .stages.report import Report, render_report_html, report_numbers
 from .workspace import LOG, Workspace
 

@@ -41,12 +41,12 @@ from backend.maths.neighbours import neighbour_planes
 from backend.point_methods import PointMethod
 from backend.provenance import versions
 from backend.scene import SurfaceMesh, no_progress
-from backend.stages import point_network
-from backend.stages.mesh import MeshConfig, vertex_normals
-from backend.stages.point_cloud import PointCloud, clean_cloud, read_cloud
-from backend.stages.point_fit import PointFitConfig, fit_points
-from backend.stages.point_mesh import mesh_of_points
-from backend.stages.point_network import NetworkConfig
+from backend.stages.mesh.extraction import MeshConfig, vertex_normals
+from backend.stages.points import point_network
+from backend.stages.points.point_cloud import PointCloud, clean_cloud, read_cloud
+from backend.stages.points.point_fit import PointFitConfig, fit_points
+from backend.stages.points.point_mesh import mesh_of_points
+from backend.stages.points.point_network import NetworkConfig
 from backend.workspace import fingerprint
 
 NAMES = ("anchor", "00011084", "00016513", "00994122")

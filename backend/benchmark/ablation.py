@@ -14,7 +14,7 @@ from ..provenance import versions
 from ..scene import StereoResult, SurfaceMesh, View
 from ..stages.report import error_numbers
 from ..stages.surface import Surface
-from ..stages.train import TrainConfig
+from ..stages.train.surface_fit import TrainConfig
 from ..workspace import fingerprint
 from .among_surroundings import error_of_subject
 from .held_out import held_out_fit, known_views

@@ -12,10 +12,11 @@ from jaxtyping import Bool, Float32
 from ..maths.metrics import psnr
 from ..maths.raycast import RayCaster, render_mesh
 from ..scene import Camera, SurfaceMesh, View, no_progress
-from ..stages.cameras import CamerasConfig
+from ..stages.cameras.solving import CamerasConfig
 from ..stages.photos import PhotosConfig
-from ..stages.radiance_field import Radiance, restored
-from ..stages.radiance_image import radiance_image
+from ..stages.published.radiance_field import restored
+from ..stages.published.radiance_image import radiance_image
+from ..stages.radiance import Radiance
 from .one_by_one import solve
 from .suites import Case
 

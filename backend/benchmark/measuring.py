@@ -22,7 +22,7 @@ from ..presets import PRESETS
 from ..provenance import code_fingerprint
 from ..records import load_record
 from ..results import RADIANCE
-from ..stages.radiance_field import Radiance
+from ..stages.radiance import Radiance
 from ..stages.report import error_numbers
 from ..waiting import without_own_policy
 from ..wire.client import ROOT, clean_environment

@@ -13,12 +13,12 @@ import torch
 from ..pipeline import fit_by_settings
 from ..presets import Settings
 from ..scene import Region, SolvedCameras, StereoResult, SurfaceMesh, View, no_progress
-from ..stages.camera_refinement import with_refined
-from ..stages.cameras import CamerasConfig, solve_cameras
-from ..stages.matching import match_solved
-from ..stages.mesh import extract_mesh
+from ..stages.cameras.solving import CamerasConfig, solve_cameras
+from ..stages.mesh.extraction import extract_mesh
 from ..stages.photos import PhotosConfig, load_photos
 from ..stages.region import find_region
+from ..stages.stereo.camera_refinement import with_refined
+from ..stages.stereo.matching import match_solved
 from ..stages.surface import ShowSurface, Surface, show_nothing
 from .suites import Case, image_paths
 

@@ -11,7 +11,7 @@ from types import MappingProxyType
 from ..machine import choose_device, peak_memory_bytes, set_up_torch
 from ..presets import Settings
 from ..stages.surface import Surface
-from ..stages.train import TrainConfig
+from ..stages.train.surface_fit import TrainConfig
 from .one_by_one import extract, fit, match, place
 from .suites import Case
 from .summary import Column, markdown

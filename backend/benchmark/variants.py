@@ -5,7 +5,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from ..presets import PRESETS, Settings
-from ..stages.unseen_side import LEAST_RADIUS
+from ..stages.train.unseen_side import LEAST_RADIUS
 
 _STEPS: Mapping[str, object] = {"train.steps": (0, 0, 100)}
 _SHORT: Mapping[str, object] = {"train.steps": 400}

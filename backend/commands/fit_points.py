@@ -79,10 +79,10 @@ def _fit_into(
     from ..maths.metrics import elsewhere_text, samples_worth_it, surface_error
     from ..mesh_files import write_mesh
     from ..pipeline import Outcome
-    from ..stages.mesh import MeshConfig
-    from ..stages.point_cloud import read_cloud
-    from ..stages.point_fit import PointFitConfig, fit_points
-    from ..stages.point_mesh import mesh_of_points
+    from ..stages.mesh.extraction import MeshConfig
+    from ..stages.points.point_cloud import read_cloud
+    from ..stages.points.point_fit import PointFitConfig, fit_points
+    from ..stages.points.point_mesh import mesh_of_points
     from ..stages.report import ReportConfig
 
     device = choose_device(parsed.device, listener.warned)

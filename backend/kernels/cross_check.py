@@ -1,6 +1,6 @@
 """Two depth maps held against each other in one pass, compiled for the CPU.
 
-The same as `backend.stages.cross_check.in_torch`, which is the reference and what a GPU runs.
+The same as `backend.stages.stereo.cross_check.in_torch`, which is the reference and what a GPU runs.
 """
 
 import numpy as np

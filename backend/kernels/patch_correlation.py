@@ -1,9 +1,9 @@
 """Warp, interpolation, window sums and correlation of patches in one pass over memory, compiled for the CPU.
 
-The same as `backend.stages.patch_agreement.in_torch`, which is the reference and what a GPU runs. There each
-step reads and writes all of its numbers, some forty times over; here a row stays in the processor's first
-cache from warp to score. Rows are worked on by loops without branches, which the compiler turns into vector
-instructions. Calls release Python's lock: tiles of an image can be worked on side by side.
+The same as `backend.stages.stereo.patch_agreement.in_torch`, which is the reference and what a GPU runs.
+There each step reads and writes all of its numbers, some forty times over; here a row stays in the
+processor's first cache from warp to score. Rows are worked on by loops without branches, which the compiler
+turns into vector instructions. Calls release Python's lock: tiles of an image can be worked on side by side.
 """
 
 import numpy as np

@@ -13,7 +13,7 @@ from ..maths.backdrop import find_backdrop
 from ..maths.geometry import pinhole_in_object
 from ..maths.pieces import whole_pieces
 from ..scene import Region, View
-from .stereo_windows import sees_region
+from .stereo.windows import sees_region
 
 _LEAST_SHARE = 0.002
 """Of the picture: less is no subject."""

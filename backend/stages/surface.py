@@ -11,7 +11,7 @@ from torch import Tensor
 from ..errors import ErrorCode, ReconstructionError
 from ..maths.grid import spacing
 from ..scene import Decision, to_unit_sphere
-from .radiance_field import Radiance
+from .radiance import Radiance
 
 COARSEST = 48
 """Nodes along each axis of the grid that finds the surface's extent."""

@@ -426,7 +426,8 @@ import torch
 from pathlib import Path
 from backend.records import save_record
 from backend.scene import Region
-from backend.stages.radiance_field import Radiance, RadianceField, RadianceShape, kept
+from backend.stages.published.radiance_field import RadianceField, kept
+from backend.stages.radiance import Radiance, RadianceShape
 
 shape = RadianceShape(width=16, layers=2, proposal_width=8, proposal_intervals=8, intervals=6)
 field = RadianceField(shape, torch.Generator().manual_seed(0))
@@ -441,7 +442,8 @@ import torch
 from pathlib import Path
 from backend.maths.radiance import composite
 from backend.records import load_record
-from backend.stages.radiance_field import Radiance, restored, sample_rays
+from backend.stages.published.radiance_field import restored, sample_rays
+from backend.stages.radiance import Radiance
 
 radiance = load_record(Path(sys.argv[2]), Radiance)
 rays = [torch.from_numpy(part).float() for part in np.load(sys.argv[1])]

@@ -9,10 +9,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from backend.scene import SolvedCameras, no_progress
-from backend.stages import focal_search
-from backend.stages.cameras import CamerasConfig, solve_cameras
-from backend.stages.confirmation import FEWEST_CONFIRMING, num_confirming, unconfirmed
-from backend.stages.nerfstudio import OPENCV_FROM_OPENGL
+from backend.stages.cameras import focal_search
+from backend.stages.cameras.confirmation import FEWEST_CONFIRMING, num_confirming, unconfirmed
+from backend.stages.cameras.nerfstudio import OPENCV_FROM_OPENGL
+from backend.stages.cameras.solving import CamerasConfig, solve_cameras
 from backend.stages.photos import PhotosConfig, load_photos
 from tests.relative_rotations import rotation_errors_deg
 

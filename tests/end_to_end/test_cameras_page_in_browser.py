@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from backend.stages.camera_report import camera_report_html
+from backend.stages.cameras.camera_report import camera_report_html
 from tests.end_to_end.test_report_in_browser import CHROMIUM
 from tests.unit.test_camera_report import report_of, solved
 

@@ -13,7 +13,7 @@ import trimesh
 
 from backend.mesh_files import read_mesh
 from backend.point_methods import PointMethod
-from backend.stages.point_network import METHODS
+from backend.stages.points.point_network import METHODS
 from backend.wire.protocol import Failed, Finished, Hello, Stage, decode
 from backend.workspace import open_workspace
 

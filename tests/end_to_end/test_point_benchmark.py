@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from backend.point_methods import PointMethod
-from backend.stages.point_network import NetworkConfig
+from backend.stages.points.point_network import NetworkConfig
 from benchmarks import points
 from benchmarks.points import cases, inputs_of, measured
 

@@ -20,8 +20,9 @@ from backend.records import save_record
 from backend.rendering import render_job
 from backend.results import RADIANCE
 from backend.scene import SurfaceMesh, no_progress
-from backend.stages.radiance_field import Radiance, RadianceField, RadianceShape, kept, restored
-from backend.stages.radiance_image import radiance_image
+from backend.stages.published.radiance_field import RadianceField, kept, restored
+from backend.stages.published.radiance_image import radiance_image
+from backend.stages.radiance import Radiance, RadianceShape
 from backend.wire.client import clean_environment
 from backend.wire.protocol import Finished, Hello, Stage, decode
 from backend.wire.protocol import Progress as WireProgress

@@ -23,9 +23,9 @@ from backend.maths.geometry import (
 )
 from backend.maths.raycast import in_picture
 from backend.scene import Camera, Region, SolvedCameras, no_progress, transform_points
-from backend.stages.camera_evidence import covariances_or_none, offsets_px
-from backend.stages.cameras import CamerasConfig, solve_cameras
-from backend.stages.triangulation import two_view_points
+from backend.stages.cameras.camera_evidence import covariances_or_none, offsets_px
+from backend.stages.cameras.solving import CamerasConfig, solve_cameras
+from backend.stages.cameras.triangulation import two_view_points
 from tests.ridge_photos import FOCAL_PX, arc_pose, look_at_origin, make_photo, render
 
 CPU = torch.device("cpu")

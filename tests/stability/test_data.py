@@ -29,18 +29,18 @@ from backend.scene import (
     no_progress,
     transform_points,
 )
-from backend.stages import patch_agreement
-from backend.stages.cameras import CamerasConfig, solve_cameras
-from backend.stages.cross_check import cross_check
-from backend.stages.mesh import MeshConfig, extract_mesh
-from backend.stages.patch_agreement import in_torch as agreement_in_torch
-from backend.stages.point_cloud import read_cloud
+from backend.stages.cameras.solving import CamerasConfig, solve_cameras
+from backend.stages.mesh.extraction import MeshConfig, extract_mesh
+from backend.stages.points.point_cloud import read_cloud
 from backend.stages.region import RegionConfig, find_region
-from backend.stages.stereo import match_views
-from backend.stages.stereo_config import StereoConfig
-from backend.stages.stereo_windows import Window, pyramid
-from backend.stages.strays import strays, without_strays
-from backend.stages.train import TrainConfig, fit_surface
+from backend.stages.stereo import patch_agreement
+from backend.stages.stereo.config import StereoConfig
+from backend.stages.stereo.cross_check import cross_check
+from backend.stages.stereo.multi_view_stereo import match_views
+from backend.stages.stereo.patch_agreement import in_torch as agreement_in_torch
+from backend.stages.stereo.strays import strays, without_strays
+from backend.stages.stereo.windows import Window, pyramid
+from backend.stages.train.surface_fit import TrainConfig, fit_surface
 from tests import synthetic_scene
 from tests.stability.surfaces import from_surface
 from tests.synthetic_scene import (

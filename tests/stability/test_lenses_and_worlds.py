@@ -38,16 +38,16 @@ from backend.scene import (
     no_progress,
     transform_points,
 )
-from backend.stages import focal_search, mapping, model_choice
-from backend.stages.cameras import CamerasConfig, solve_cameras
-from backend.stages.known_cameras import read_cameras
-from backend.stages.mesh import MeshConfig, extract_mesh
-from backend.stages.nerfstudio import OPENCV_FROM_OPENGL
+from backend.stages.cameras import focal_search, mapping, model_choice
+from backend.stages.cameras.known_cameras import read_cameras
+from backend.stages.cameras.nerfstudio import OPENCV_FROM_OPENGL
+from backend.stages.cameras.solving import CamerasConfig, solve_cameras
+from backend.stages.mesh.extraction import MeshConfig, extract_mesh
 from backend.stages.region import RegionConfig, find_region
-from backend.stages.stereo import match_views
-from backend.stages.stereo_config import StereoConfig
+from backend.stages.stereo.config import StereoConfig
+from backend.stages.stereo.multi_view_stereo import match_views
 from backend.stages.surface import Surface
-from backend.stages.train import TrainConfig, fit_surface
+from backend.stages.train.surface_fit import TrainConfig, fit_surface
 from tests.ridge_photos import FOCAL_PX, WIDTH, arc_pose, make_photo, render
 from tests.stability.surfaces import from_surface
 from tests.synthetic_scene import (

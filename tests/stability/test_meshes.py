@@ -11,7 +11,7 @@ from skimage.measure import marching_cubes
 
 from backend.errors import ErrorCode, ReconstructionError
 from backend.maths.faces import face_areas
-from backend.stages.mesh import level_set, simplified, without_short_edges
+from backend.stages.mesh.extraction import level_set, simplified, without_short_edges
 from backend.stages.surface import Surface
 from tests.stability.sweep import Sweep, check
 

@@ -21,24 +21,25 @@ from backend.errors import ErrorCode, ReconstructionError
 from backend.maths.grid import interpolate, locate
 from backend.point_methods import PointMethod
 from backend.scene import Decision, StereoResult, View, no_progress, transform_points
-from backend.stages import field_surface, neus_fit, point_network, radiance_fit
 from backend.stages.deadline import deadline_after
 from backend.stages.measurements import Measurements, carried, measurements
-from backend.stages.networks import HashConfig, NetworkConfig, NeuralSurface
-from backend.stages.neus_fit import NeusConfig, fit_neus
-from backend.stages.neus_losses import MeasuredPoints, Sampling, Weights
-from backend.stages.point_cloud import PointCloud, clean_cloud
-from backend.stages.point_fit import PointFitConfig, fit_points
-from backend.stages.point_network import METHODS
-from backend.stages.point_network import NetworkConfig as PointNetworkConfig
-from backend.stages.radiance_field import RadianceShape
-from backend.stages.radiance_fit import RadianceConfig, fit_radiance
-from backend.stages.render_fit import Refined, RenderConfig, refine
+from backend.stages.points import point_network
+from backend.stages.points.point_cloud import PointCloud, clean_cloud
+from backend.stages.points.point_fit import PointFitConfig, fit_points
+from backend.stages.points.point_network import METHODS
+from backend.stages.points.point_network import NetworkConfig as PointNetworkConfig
+from backend.stages.published import field_surface, neus_fit, radiance_fit
+from backend.stages.published.networks import HashConfig, NetworkConfig, NeuralSurface
+from backend.stages.published.neus_fit import NeusConfig, fit_neus
+from backend.stages.published.neus_losses import MeasuredPoints, Sampling, Weights
+from backend.stages.published.radiance_fit import RadianceConfig, fit_radiance
+from backend.stages.radiance import RadianceShape
 from backend.stages.safe_steps import PATIENCE, SafeSteps
-from backend.stages.stereo import match_views, unmatched
-from backend.stages.stereo_config import StereoConfig
+from backend.stages.stereo.config import StereoConfig
+from backend.stages.stereo.multi_view_stereo import match_views, unmatched
 from backend.stages.surface import Surface
-from backend.stages.train import TrainConfig, fit_surface
+from backend.stages.train.render_fit import Refined, RenderConfig, refine
+from backend.stages.train.surface_fit import TrainConfig, fit_surface
 from tests.synthetic_scene import Scene, photographed, ring_cameras, surface_points, true_region
 
 CPU = torch.device("cpu")

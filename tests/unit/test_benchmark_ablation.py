@@ -21,7 +21,7 @@ from backend.presets import PRESETS, Settings
 from backend.scene import SurfaceMesh
 from backend.stages.photos import PhotosConfig
 from backend.stages.report import ReportConfig, flat_settings
-from backend.stages.train import TrainConfig
+from backend.stages.train.surface_fit import TrainConfig
 from benchmarks import ablation as command
 from tests.synthetic_scene import photographed, ring_cameras, write_scene
 

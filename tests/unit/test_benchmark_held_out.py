@@ -11,7 +11,8 @@ from backend.benchmark.held_out import held_out_fit, held_out_radiance_fit, know
 from backend.benchmark.suites import Case
 from backend.maths.raycast import render_mesh
 from backend.scene import Camera, Region, SurfaceMesh, View
-from backend.stages.radiance_field import RadianceField, RadianceShape, kept
+from backend.stages.published.radiance_field import RadianceField, kept
+from backend.stages.radiance import RadianceShape
 from tests.synthetic_scene import photographed, ring_cameras, write_scene
 
 GREY = 102

@@ -25,7 +25,7 @@ from backend.benchmark.suites import Case
 from backend.presets import PRESETS, Settings
 from backend.stages.photos import PhotosConfig
 from backend.stages.report import flat_settings
-from backend.stages.train import TrainConfig
+from backend.stages.train.surface_fit import TrainConfig
 from benchmarks import scaling as command
 from tests.synthetic_scene import photographed, ring_cameras, write_scene
 

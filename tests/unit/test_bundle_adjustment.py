@@ -11,9 +11,9 @@ import torch
 
 from backend.maths.gauge import in_gauge_of_the_whole
 from backend.scene import Camera
-from backend.stages.camera_evidence import covariances_or_none, offsets_px
-from backend.stages.lenses import rigid_matrix, shared_tracks
-from backend.stages.triangulation import two_view_points
+from backend.stages.cameras.camera_evidence import covariances_or_none, offsets_px
+from backend.stages.cameras.lenses import rigid_matrix, shared_tracks
+from backend.stages.cameras.triangulation import two_view_points
 from tests.bundle_adjustment_reference import (
     NUM_GAUGE,
     Adjusted,

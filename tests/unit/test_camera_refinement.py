@@ -11,8 +11,8 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from backend.scene import Camera, StereoResult, SurfacePoints, View, no_progress, transform_points
-from backend.stages import camera_refinement, matching
-from backend.stages.camera_refinement import (
+from backend.stages.stereo import camera_refinement, matching
+from backend.stages.stereo.camera_refinement import (
     Sightings,
     find_patches,
     largest_move_px,
@@ -21,8 +21,8 @@ from backend.stages.camera_refinement import (
     with_cameras,
     with_refined,
 )
-from backend.stages.matching import match_solved
-from backend.stages.stereo_config import StereoConfig
+from backend.stages.stereo.config import StereoConfig
+from backend.stages.stereo.matching import match_solved
 from tests.relative_rotations import rotation_errors_deg
 from tests.synthetic_scene import (
     DISTANCE,

@@ -12,14 +12,14 @@ from markupsafe import Markup
 
 from backend.report_page.diagrams import Bar, histogram, match_graph, shortened, top_view
 from backend.scene import CameraEvidence, Decision, SolvedCameras, Unplaced
-from backend.stages.camera_report import (
+from backend.stages.cameras.camera_report import (
     CameraReport,
     build_camera_report,
     camera_report_html,
     camera_report_numbers,
     point_angles_deg,
 )
-from backend.stages.confirmation import (
+from backend.stages.cameras.confirmation import (
     FEWEST_CONFIRMING,
     num_confirming,
     unconfirmed,

@@ -18,11 +18,15 @@ from scipy.spatial.transform import Rotation
 
 from backend.errors import Cancelled, ErrorCode, ReconstructionError
 from backend.scene import Decision, Photo, SolvedCameras, Unplaced, no_progress
-from backend.stages import features, focal_search, model_choice, model_merit
-from backend.stages.camera_report import build_camera_report, camera_report_html, camera_report_numbers
-from backend.stages.cameras import CamerasConfig, solve_cameras
-from backend.stages.confirmation import num_confirming
-from backend.stages.lens_refinement import Gaussian, joined, refine_lenses
+from backend.stages.cameras import features, focal_search, model_choice, model_merit
+from backend.stages.cameras.camera_report import (
+    build_camera_report,
+    camera_report_html,
+    camera_report_numbers,
+)
+from backend.stages.cameras.confirmation import num_confirming
+from backend.stages.cameras.lens_refinement import Gaussian, joined, refine_lenses
+from backend.stages.cameras.solving import CamerasConfig, solve_cameras
 from backend.stages.region import RegionConfig, find_region
 from tests.relative_rotations import rotation_errors_deg
 from tests.ridge_photos import FOCAL_PX, HEIGHT, WIDTH, arc_pose, look_at_origin, make_photo, render

@@ -17,10 +17,10 @@ from scipy.spatial.transform import Rotation
 from backend.errors import ErrorCode, ReconstructionError
 from backend.mesh_files import write_sparse
 from backend.scene import Photo, Region, SolvedCameras, Unplaced, no_progress, to_unit_sphere
-from backend.stages.cameras import CamerasConfig, solve_cameras
-from backend.stages.copies import copies_apart_text
-from backend.stages.known_cameras import checked_pose, match_by_name, read_cameras
-from backend.stages.nerfstudio import OPENCV_FROM_OPENGL, frame_lens, transforms_json
+from backend.stages.cameras.copies import copies_apart_text
+from backend.stages.cameras.known_cameras import checked_pose, match_by_name, read_cameras
+from backend.stages.cameras.nerfstudio import OPENCV_FROM_OPENGL, frame_lens, transforms_json
+from backend.stages.cameras.solving import CamerasConfig, solve_cameras
 from tests.lens_models import LENSES
 
 WIDTH, HEIGHT = 64, 48

@@ -10,7 +10,7 @@ import pytest
 
 from backend.errors import ErrorCode, ReconstructionError
 from backend.scene import Photo
-from backend.stages.lenses import (
+from backend.stages.cameras.lenses import (
     SMALLEST_ZOOM,
     PlacedPhoto,
     is_pinhole,

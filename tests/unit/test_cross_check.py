@@ -9,7 +9,7 @@ from torch import Tensor
 
 from backend.kernels import side_by_side
 from backend.maths.geometry import Pinhole, pinhole_in_object
-from backend.stages.cross_check import cross_check, in_torch
+from backend.stages.stereo.cross_check import cross_check, in_torch
 from tests.synthetic_scene import OBJECT_UNIT, Scene, arc_cameras, photographed, true_region
 
 LIMITS = {"least_score": 0.4, "largest_px": 1.0}

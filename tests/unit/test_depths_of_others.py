@@ -6,10 +6,10 @@ import pytest
 import torch
 from torch import Tensor
 
-from backend.stages.depths_of_others import unconfirmed, with_depths_of
-from backend.stages.plane_sweep import Map, inverse_depth_range, step_of_one_pixel
-from backend.stages.stereo_config import StereoConfig
-from backend.stages.stereo_windows import Window, pyramid
+from backend.stages.stereo.config import StereoConfig
+from backend.stages.stereo.depths_of_others import unconfirmed, with_depths_of
+from backend.stages.stereo.plane_sweep import Map, inverse_depth_range, step_of_one_pixel
+from backend.stages.stereo.windows import Window, pyramid
 from tests.synthetic_scene import OBJECT_UNIT, arc_cameras, photographed, true_region
 
 CONFIG = StereoConfig()

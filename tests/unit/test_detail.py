@@ -12,9 +12,9 @@ from backend.maths.evidence import scatter_between
 from backend.maths.geometry import Pinhole
 from backend.maths.grid import node_positions, read, spacing
 from backend.scene import Decision
-from backend.stages.detail import add_detail
-from backend.stages.linear_fit import LinearConfig
 from backend.stages.measurements import Measurements
+from backend.stages.train.detail import add_detail
+from backend.stages.train.linear_fit import LinearConfig
 
 COARSE, FINE = 32, 64
 WAVE = 5 * spacing(COARSE)

@@ -8,9 +8,9 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from backend.scene import Camera, SolvedCameras, StereoResult, no_progress
-from backend.stages.disagreement import disagreement, outlines_of_masks_miss_px
-from backend.stages.matching import match_solved
-from backend.stages.stereo_config import StereoConfig
+from backend.stages.stereo.config import StereoConfig
+from backend.stages.stereo.disagreement import disagreement, outlines_of_masks_miss_px
+from backend.stages.stereo.matching import match_solved
 from tests.synthetic_scene import CENTRE, Scene, arc_cameras, photographed, true_region
 
 

@@ -5,7 +5,7 @@ import torch
 from torch import Tensor, nn
 
 from backend.maths.grid import interpolate, locate, near_surface, node_positions, value_and_gradient
-from backend.stages.field import SurfaceField
+from backend.stages.train.field import SurfaceField
 
 CPU = torch.device("cpu")
 NODES = 9

@@ -8,7 +8,7 @@ from torch import Tensor
 from backend.errors import ErrorCode, ReconstructionError
 from backend.maths.grid import node_positions
 from backend.scene import Region, to_unit_sphere, transform_points
-from backend.stages.field_surface import field_surface, surface_in
+from backend.stages.published.field_surface import field_surface, surface_in
 
 CPU = torch.device("cpu")
 REGION = Region(object_from_world=to_unit_sphere(np.array([5.0, -2.0, 1.0]), 3.0))

@@ -10,9 +10,9 @@ from torch import Tensor
 
 from backend.maths.geometry import Pinhole, pixel_centres, ray_directions, unproject
 from backend.maths.grid import node_positions, read
-from backend.stages.flat_faces import FlatFaces, flat_faces, no_faces
-from backend.stages.linear_fit import LinearConfig, fit_level
 from backend.stages.measurements import Measurements
+from backend.stages.train.flat_faces import FlatFaces, flat_faces, no_faces
+from backend.stages.train.linear_fit import LinearConfig, fit_level
 from tests.turned_camera import ball_depth, turned_camera
 
 SIZE = 320

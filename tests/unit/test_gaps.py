@@ -8,9 +8,9 @@ import torch
 from jaxtyping import Bool
 
 from backend.scene import DepthMap, SurfacePoints, no_progress, transform_points
-from backend.stages.gaps import without_covered_patches
-from backend.stages.stereo import match_views
-from backend.stages.stereo_config import StereoConfig
+from backend.stages.stereo.config import StereoConfig
+from backend.stages.stereo.gaps import without_covered_patches
+from backend.stages.stereo.multi_view_stereo import match_views
 from tests.synthetic_scene import Scene, arc_cameras, photographed, plain_points, true_region
 
 Patch = Bool[np.ndarray, "120 160"]

@@ -12,10 +12,10 @@ from backend.errors import Cancelled
 from backend.maths.grid import node_positions
 from backend.maths.raycast import camera_rays
 from backend.scene import DepthMap, Ground, StereoResult, no_progress, transform_points
-from backend.stages.ground import find_ground, without_ground
 from backend.stages.measurements import carried, measurements
-from backend.stages.silhouettes import least_distance
-from backend.stages.stereo_config import StereoConfig
+from backend.stages.stereo.config import StereoConfig
+from backend.stages.stereo.ground import find_ground, without_ground
+from backend.stages.train.silhouettes import least_distance
 from tests.synthetic_scene import (
     CENTRE,
     GROUND_Z,

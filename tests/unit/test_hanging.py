@@ -7,7 +7,7 @@ import pytest
 from jaxtyping import Float64
 
 from backend.scene import Camera, DepthMap, Region, StereoResult, View
-from backend.stages.hanging import without_hanging
+from backend.stages.stereo.hanging import without_hanging
 from tests.synthetic_scene import plain_points
 
 REGION = Region(object_from_world=np.diag([0.5, 0.5, 0.5, 1.0]))

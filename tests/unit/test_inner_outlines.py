@@ -11,9 +11,9 @@ from torch import Tensor
 
 from backend.maths.geometry import Pinhole, pixel_centres, ray_directions, unproject
 from backend.maths.grid import node_positions, read, spacing
-from backend.stages.inner_outlines import FarSide, decision, far_sides
-from backend.stages.linear_fit import LinearConfig, fit_level
 from backend.stages.measurements import Measurements
+from backend.stages.train.inner_outlines import FarSide, decision, far_sides
+from backend.stages.train.linear_fit import LinearConfig, fit_level
 
 NODES = 64
 SIZE = 160

@@ -11,11 +11,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from backend.scene import no_progress
-from backend.stages import features, focal_search, model_merit
-from backend.stages.bundle_adjustment import adjust_bundle
-from backend.stages.cameras import CamerasConfig, solve_cameras
-from backend.stages.lens_doubt import contradicted_lenses
-from backend.stages.lens_refinement import refine_lenses
+from backend.stages.cameras import features, focal_search, model_merit
+from backend.stages.cameras.bundle_adjustment import adjust_bundle
+from backend.stages.cameras.lens_doubt import contradicted_lenses
+from backend.stages.cameras.lens_refinement import refine_lenses
+from backend.stages.cameras.solving import CamerasConfig, solve_cameras
 from tests.ridge_photos import FOCAL_PX, HEIGHT, WIDTH, arc_pose, make_photo, render
 
 TRUE_FOCAL_PX = 1300.0

@@ -6,7 +6,7 @@ import numpy as np
 import torch
 
 from backend.stages.measurements import measurements
-from backend.stages.stereo import unmatched
+from backend.stages.stereo.multi_view_stereo import unmatched
 from tests.synthetic_scene import faced_points, photographed, ring_cameras, true_region
 
 CPU = torch.device("cpu")

@@ -20,7 +20,7 @@ from backend.scene import (
     no_progress,
     transform_points,
 )
-from backend.stages.mesh import (
+from backend.stages.mesh.extraction import (
     MeshConfig,
     extract_mesh,
     in_seen_pieces,

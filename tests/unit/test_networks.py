@@ -5,8 +5,8 @@ import torch
 from torch import Tensor
 
 from backend.presets import PRESETS
-from backend.stages.networks import HashConfig, Linear, NetworkConfig, NeuralSurface
-from backend.stages.neus_fit import NeusConfig
+from backend.stages.published.networks import HashConfig, Linear, NetworkConfig, NeuralSurface
+from backend.stages.published.neus_fit import NeusConfig
 
 
 def published(name: str) -> NetworkConfig:

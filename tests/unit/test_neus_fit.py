@@ -20,15 +20,16 @@ from backend.scene import (
     View,
     no_progress,
 )
-from backend.stages import field_surface, neus_fit, render_fit
-from backend.stages.field import SurfaceField
 from backend.stages.measurements import measurements
-from backend.stages.mesh import level_set
-from backend.stages.networks import HashConfig, NetworkConfig, NeuralSurface
-from backend.stages.neus_fit import NeusConfig, active_levels, finest_detail, fit_neus, rate_share
-from backend.stages.neus_losses import Moment, Sampling, Weights, measured_points, point_loss
-from backend.stages.render_fit import RenderConfig
+from backend.stages.mesh.extraction import level_set
+from backend.stages.published import field_surface, neus_fit
+from backend.stages.published.networks import HashConfig, NetworkConfig, NeuralSurface
+from backend.stages.published.neus_fit import NeusConfig, active_levels, finest_detail, fit_neus, rate_share
+from backend.stages.published.neus_losses import Moment, Sampling, Weights, measured_points, point_loss
 from backend.stages.surface import ShowSurface, Surface, show_nothing
+from backend.stages.train import render_fit
+from backend.stages.train.field import SurfaceField
+from backend.stages.train.render_fit import RenderConfig
 from tests.synthetic_scene import (
     CENTRE,
     Scene,

@@ -10,14 +10,14 @@ import pytest
 import torch
 
 from backend.scene import StereoResult, no_progress
-from backend.stages.networks import HashConfig, NetworkConfig
-from backend.stages.neus_fit import NeusConfig, fit_neus
-from backend.stages.neus_losses import Sampling, Weights
-from backend.stages.radiance_fit import RadianceConfig, fit_radiance
-from backend.stages.stereo import match_views
-from backend.stages.stereo_config import StereoConfig
+from backend.stages.published.networks import HashConfig, NetworkConfig
+from backend.stages.published.neus_fit import NeusConfig, fit_neus
+from backend.stages.published.neus_losses import Sampling, Weights
+from backend.stages.published.radiance_fit import RadianceConfig, fit_radiance
+from backend.stages.stereo.config import StereoConfig
+from backend.stages.stereo.multi_view_stereo import match_views
 from backend.stages.surface import Surface
-from backend.stages.train import TrainConfig, fit_surface
+from backend.stages.train.surface_fit import TrainConfig, fit_surface
 from tests.synthetic_scene import Scene, arc_cameras, photographed, true_region
 
 pytestmark = [

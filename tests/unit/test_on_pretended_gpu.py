@@ -9,11 +9,11 @@ import torch
 from torch import Tensor
 
 from backend.scene import StereoResult, no_progress
-from backend.stages.render_fit import RenderConfig
-from backend.stages.stereo import match_views
-from backend.stages.stereo_config import StereoConfig
+from backend.stages.stereo.config import StereoConfig
+from backend.stages.stereo.multi_view_stereo import match_views
 from backend.stages.surface import Surface
-from backend.stages.train import TrainConfig, fit_surface
+from backend.stages.train.render_fit import RenderConfig
+from backend.stages.train.surface_fit import TrainConfig, fit_surface
 from tests.pretended_gpu import GPU, PretendedGpu, RefusedError, claims
 from tests.synthetic_scene import Scene, arc_cameras, photographed, true_region
 
@@ -78,7 +78,9 @@ def test_stereo_and_fit_run_on_a_gpu_as_on_the_cpu(
     scene: Callable[[], Scene], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Compiled and not, they round differently; a cell of 48 nodes is 0.04 of the frame's units."""
-    monkeypatch.setattr("backend.stages.looks.MOSTLY_TEXTURED", 1.0)  # so that brightness is asked as well
+    monkeypatch.setattr(
+        "backend.stages.train.looks.MOSTLY_TEXTURED", 1.0
+    )  # so that brightness is asked as well
     config = TrainConfig(
         levels=(32, 48), rounds=(4, 4), steps=(0, 2), looks=(0, 2, 2), render=RenderConfig(rays=64)
     )

@@ -11,9 +11,9 @@ from backend.maths.atlas import faces_at
 from backend.maths.raycast import interpolate
 from backend.maths.sampling import colours_at
 from backend.scene import Camera, Lens, SurfaceMesh, View
-from backend.stages.lenses import colmap_lens
-from backend.stages.originals import Original, close_up, close_up_camera
-from backend.stages.texture import TextureConfig, paint
+from backend.stages.cameras.lenses import colmap_lens
+from backend.stages.mesh.originals import Original, close_up, close_up_camera
+from backend.stages.mesh.texture import TextureConfig, paint
 
 WIDTH, HEIGHT, FOCAL_PX = 600, 400, 520.0
 DISTANCE = 2.0

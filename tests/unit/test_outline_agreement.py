@@ -16,9 +16,9 @@ from backend.maths.outline_fit import Features, fit_to_outlines, outlines_miss_p
 from backend.maths.posed_views import POSE, PosedViews, posed_views
 from backend.maths.silhouette import Silhouette, silhouette_or_none
 from backend.scene import Photo, no_progress
-from backend.stages import structure_from_motion
-from backend.stages.features import picture_name
-from backend.stages.outline_cameras import held_against_outlines
+from backend.stages.cameras import structure_from_motion
+from backend.stages.cameras.features import picture_name
+from backend.stages.cameras.outline_cameras import held_against_outlines
 from tests.relative_rotations import rotation_errors_deg
 from tests.synthetic_scene import CENTRE, SIZE, Scene, arc_cameras, photographed, surface_points
 

@@ -7,7 +7,7 @@ import PIL.Image  # noqa: F401 - before pycolmap
 import pycolmap
 import pytest
 
-from backend.stages.parallax import FEWEST_SHARED, why_unplaced
+from backend.stages.cameras.parallax import FEWEST_SHARED, why_unplaced
 
 NUM_FEATURES = {"0.png": 400, "1.png": 300, "even.png": 3, "alone.png": 200, "few.png": 200, "many.png": 200}
 SHARED = {

@@ -9,10 +9,10 @@ import torch
 from torch import Tensor
 
 from backend.maths.correlation import patch_statistics
-from backend.stages import patch_agreement
-from backend.stages.patch_agreement import agreement, in_torch
-from backend.stages.stereo_config import StereoConfig
-from backend.stages.stereo_windows import Window, pyramid
+from backend.stages.stereo import patch_agreement
+from backend.stages.stereo.config import StereoConfig
+from backend.stages.stereo.patch_agreement import agreement, in_torch
+from backend.stages.stereo.windows import Window, pyramid
 from tests.synthetic_scene import OBJECT_UNIT, Scene, arc_cameras, photographed, true_region
 
 

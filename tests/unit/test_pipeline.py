@@ -17,7 +17,7 @@ from backend.pipeline import Job, Listener, Stages
 from backend.presets import PRESETS
 from backend.records import load_record
 from backend.scene import Photo, Region, SolvedCameras, StereoResult
-from backend.stages.stereo import unmatched
+from backend.stages.stereo.multi_view_stereo import unmatched
 from backend.stages.surface import Surface
 from backend.workspace import StageCost, open_workspace
 from tests.synthetic_scene import arc_cameras, photographed, true_region

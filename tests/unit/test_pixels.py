@@ -6,7 +6,7 @@ from backend.maths.geometry import project
 from backend.maths.rays import sphere_span
 from backend.stages.measurements import Measurements, measurements
 from backend.stages.pixels import pixels_of_unit_sphere, rays_through
-from backend.stages.stereo import unmatched
+from backend.stages.stereo.multi_view_stereo import unmatched
 from tests.synthetic_scene import Scene, photographed, ring_cameras, true_region
 
 

@@ -10,8 +10,10 @@ from torch import Tensor
 
 from backend.maths.raycast import RayCaster, camera_rays
 from backend.scene import Camera, StereoResult, View, no_progress
-from backend.stages.patch_agreement import agreement
-from backend.stages.plane_sweep import (
+from backend.stages.stereo.config import StereoConfig
+from backend.stages.stereo.multi_view_stereo import match_views
+from backend.stages.stereo.patch_agreement import agreement
+from backend.stages.stereo.plane_sweep import (
     Map,
     better_of,
     inverse_depth_range,
@@ -20,9 +22,7 @@ from backend.stages.plane_sweep import (
     subject_of,
     swept_again,
 )
-from backend.stages.stereo import match_views
-from backend.stages.stereo_config import StereoConfig
-from backend.stages.stereo_windows import Window, pyramid
+from backend.stages.stereo.windows import Window, pyramid
 from tests.synthetic_scene import (
     CENTRE,
     OBJECT_UNIT,

@@ -14,7 +14,7 @@ from addon.ply import PlyMesh, read_ply
 from addon.ply import write_points as write_cloud
 from backend.mesh_files import write_mesh, write_points
 from backend.scene import Region, SurfaceMesh, SurfacePoints, Texture, to_unit_sphere
-from backend.stages.point_cloud import read_cloud
+from backend.stages.points.point_cloud import read_cloud
 
 TRIANGLE = b"""ply
 format binary_little_endian 1.0

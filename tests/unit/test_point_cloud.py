@@ -7,7 +7,7 @@ import pytest
 import trimesh
 
 from backend.errors import ErrorCode, ReconstructionError
-from backend.stages.point_cloud import FEWEST_POINTS, clean_cloud, read_cloud
+from backend.stages.points.point_cloud import FEWEST_POINTS, clean_cloud, read_cloud
 
 
 def some_points(count: int = 100) -> np.ndarray:

@@ -14,12 +14,12 @@ import trimesh
 from backend.errors import Cancelled, ErrorCode, ReconstructionError
 from backend.point_methods import PointMethod
 from backend.scene import SurfaceMesh, no_progress
-from backend.stages import point_network
-from backend.stages.mesh import MeshConfig
-from backend.stages.point_cloud import PointCloud, clean_cloud
-from backend.stages.point_fit import PointFitConfig, fit_points
-from backend.stages.point_mesh import mesh_of_points
-from backend.stages.point_network import METHODS, NetworkConfig, PointNetwork, Queries
+from backend.stages.mesh.extraction import MeshConfig
+from backend.stages.points import point_network
+from backend.stages.points.point_cloud import PointCloud, clean_cloud
+from backend.stages.points.point_fit import PointFitConfig, fit_points
+from backend.stages.points.point_mesh import mesh_of_points
+from backend.stages.points.point_network import METHODS, NetworkConfig, PointNetwork, Queries
 from backend.stages.safe_steps import PATIENCE, SafeSteps
 
 CPU = torch.device("cpu")

@@ -12,7 +12,7 @@ import pytest
 from backend.doctor import DEPENDENCIES
 from backend.pipeline import FITS
 from backend.presets import PRESETS, Settings
-from backend.stages.train import TrainConfig
+from backend.stages.train.surface_fit import TrainConfig
 from backend.version import VERSION
 from backend.wire import protocol
 

@@ -9,7 +9,7 @@ import trimesh
 from backend.mesh_files import read_mesh
 from backend.previews import Previews
 from backend.scene import Region, SurfacePoints, to_unit_sphere
-from backend.stages.mesh import PREVIEW_FACES, preview_mesh
+from backend.stages.mesh.extraction import PREVIEW_FACES, preview_mesh
 from backend.stages.surface import Surface
 from backend.workspace import Workspace
 

@@ -13,11 +13,17 @@ from backend.errors import Cancelled, ErrorCode, ReconstructionError
 from backend.maths.metrics import psnr
 from backend.records import load_record, save_record
 from backend.scene import Progress, View, no_progress
-from backend.stages.mesh import MeshConfig, extract_mesh, level_set
-from backend.stages.radiance_field import Radiance, RadianceField, RadianceShape, kept, restored, sample_rays
-from backend.stages.radiance_fit import RadianceConfig, fit_radiance
-from backend.stages.radiance_image import RadianceImage, radiance_image
-from backend.stages.stereo import unmatched
+from backend.stages.mesh.extraction import MeshConfig, extract_mesh, level_set
+from backend.stages.published.radiance_field import (
+    RadianceField,
+    kept,
+    restored,
+    sample_rays,
+)
+from backend.stages.published.radiance_fit import RadianceConfig, fit_radiance
+from backend.stages.published.radiance_image import RadianceImage, radiance_image
+from backend.stages.radiance import Radiance, RadianceShape
+from backend.stages.stereo.multi_view_stereo import unmatched
 from backend.stages.surface import Surface
 from tests.synthetic_scene import Scene, diagonal, photographed, ring_cameras, surface_distance, true_region
 

@@ -12,7 +12,7 @@ import trimesh
 from backend.commands import rehearsed_files
 from backend.mesh_files import read_mesh, read_sparse, write_mesh, write_sparse
 from backend.scene import no_progress
-from backend.stages.nerfstudio import read_frames, world_from_camera
+from backend.stages.cameras.nerfstudio import read_frames, world_from_camera
 from backend.stages.report import ReportConfig, build_report, mesh_facts, report_numbers
 from tests.report_scene import finished_run
 

@@ -16,10 +16,10 @@ from torch import Tensor
 from backend.maths.geometry import Pinhole, pixel_centres, project, ray_directions
 from backend.maths.grid import locate, node_positions, spacing, value_and_gradient
 from backend.scene import transform_points
-from backend.stages.linear_fit import LinearConfig, fit_level, start
 from backend.stages.measurements import Measurements, measurements
-from backend.stages.rims import rim_points, rim_rays
-from backend.stages.stereo import unmatched
+from backend.stages.stereo.multi_view_stereo import unmatched
+from backend.stages.train.linear_fit import LinearConfig, fit_level, start
+from backend.stages.train.rims import rim_points, rim_rays
 from tests.synthetic_scene import (
     DISTANCE,
     SIZE,

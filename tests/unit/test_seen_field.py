@@ -5,7 +5,7 @@ import torch
 
 from backend.maths.geometry import Pinhole
 from backend.maths.grid import node_positions
-from backend.stages.seen_field import NearSurface, may_show, seen_field
+from backend.stages.train.seen_field import NearSurface, may_show, seen_field
 
 CPU = torch.device("cpu")
 

@@ -15,13 +15,13 @@ from backend.maths.grid import locate, node_positions, read, spacing, value_and_
 from backend.maths.mirrored_light import BINS
 from backend.maths.srgb import srgb_from_linear
 from backend.scene import Decision
-from backend.stages import shared_brightness as stage
 from backend.stages.deadline import deadline_after
-from backend.stages.linear_fit import LinearConfig, ask_nothing, fit_level, for_plain
-from backend.stages.looks import Looks
 from backend.stages.measurements import SURE, Measurements
-from backend.stages.shared_brightness import ShownPlaces, share_told, shared_brightness, textured
-from backend.stages.shine import Boxes, deviations, mirrored_by
+from backend.stages.train import shared_brightness as stage
+from backend.stages.train.linear_fit import LinearConfig, ask_nothing, fit_level, for_plain
+from backend.stages.train.looks import Looks
+from backend.stages.train.shared_brightness import ShownPlaces, share_told, shared_brightness, textured
+from backend.stages.train.shine import Boxes, deviations, mirrored_by
 from tests.turned_camera import ball_depth, turned_camera
 
 NODES, SIZE, RADIUS = 64, 320, 0.6

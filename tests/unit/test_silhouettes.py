@@ -16,12 +16,12 @@ from backend.maths.geometry import Pinhole, pixel_centres, ray_directions
 from backend.maths.grid import node_positions, read, spacing
 from backend.maths.rays import first_crossing
 from backend.maths.smooth_fit import fit_smooth
-from backend.stages import linear_fit, unseen_depth
-from backend.stages.linear_fit import LinearConfig
 from backend.stages.measurements import Measurements
-from backend.stages.silhouettes import inside_along, least_distance, middles, missing, silhouette_rays
-from backend.stages.unseen_depth import depth_behind
-from backend.stages.unseen_side import DEEPEST, ball_behind, explained_radius, seen_depth
+from backend.stages.train import linear_fit, unseen_depth
+from backend.stages.train.linear_fit import LinearConfig
+from backend.stages.train.silhouettes import inside_along, least_distance, middles, missing, silhouette_rays
+from backend.stages.train.unseen_depth import depth_behind
+from backend.stages.train.unseen_side import DEEPEST, ball_behind, explained_radius, seen_depth
 
 CPU = torch.device("cpu")
 SIZE = 160

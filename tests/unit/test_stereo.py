@@ -14,11 +14,11 @@ from backend.errors import Cancelled, ErrorCode, ReconstructionError
 from backend.maths.geometry import Pinhole, pinhole_in_object
 from backend.maths.raycast import camera_rays
 from backend.scene import Camera, Region, StereoResult, View, no_progress, to_unit_sphere, transform_points
-from backend.stages.depth_maps import depth_maps
-from backend.stages.outlines_alone import hollows_filled
-from backend.stages.stereo import match_views
-from backend.stages.stereo_config import StereoConfig
-from backend.stages.stereo_windows import neighbours, pyramid, views_between
+from backend.stages.stereo.config import StereoConfig
+from backend.stages.stereo.depth_maps import depth_maps
+from backend.stages.stereo.multi_view_stereo import match_views
+from backend.stages.stereo.outlines_alone import hollows_filled
+from backend.stages.stereo.windows import neighbours, pyramid, views_between
 from tests.synthetic_scene import (
     CENTRE,
     OBJECT_UNIT,

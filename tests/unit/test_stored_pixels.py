@@ -11,13 +11,13 @@ from PIL import ExifTags, Image
 from backend.errors import ErrorCode, ReconstructionError
 from backend.maths.sampling import colours_at
 from backend.scene import Photo, Region, no_progress
-from backend.stages.cameras import CamerasConfig, solve_cameras
-from backend.stages.known_cameras import may_be_unturned, read_placement
-from backend.stages.lenses import Placement, undistorted_view
-from backend.stages.nerfstudio import transforms_json
+from backend.stages.cameras.known_cameras import may_be_unturned, read_placement
+from backend.stages.cameras.lenses import Placement, undistorted_view
+from backend.stages.cameras.nerfstudio import transforms_json
+from backend.stages.cameras.solving import CamerasConfig, solve_cameras
+from backend.stages.cameras.stored_pixels import turned_clockwise
+from backend.stages.cameras.which_way_up import read_placement_that_fits
 from backend.stages.photos import PhotosConfig, load_photos
-from backend.stages.stored_pixels import turned_clockwise
-from backend.stages.which_way_up import read_placement_that_fits
 from tests.lens_models import LENSES
 from tests.synthetic_scene import Scene, arc_cameras, photographed, write_scene
 

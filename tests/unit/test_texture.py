@@ -15,9 +15,9 @@ from backend.maths.pieces import connected_pieces
 from backend.maths.projection import projected
 from backend.maths.raycast import RayCaster, interpolate, render_mesh, visible_from
 from backend.scene import Camera, SurfaceMesh, Texture, View
-from backend.stages import texture as stage
-from backend.stages.mesh import simplified, vertex_normals
-from backend.stages.texture import TextureConfig, bleed, paint
+from backend.stages.mesh import texture as stage
+from backend.stages.mesh.extraction import simplified, vertex_normals
+from backend.stages.mesh.texture import TextureConfig, bleed, paint
 from tests.synthetic_scene import arc_cameras, photographed, texture_srgb, true_mesh
 
 MARKER = np.array([255, 0, 255], np.uint8)

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from backend.scene import no_progress
-from backend.stages import features
-from backend.stages.features import LensGroup
-from backend.stages.tilted_features import narrowed
+from backend.stages.cameras import features
+from backend.stages.cameras.features import LensGroup
+from backend.stages.cameras.tilted_features import narrowed
 from tests.ridge_photos import HEIGHT, WIDTH, arc_pose, render
 
 NAMES = ("0000.png", "0001.png")

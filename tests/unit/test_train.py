@@ -29,15 +29,15 @@ from backend.scene import (
     transform_points,
     within,
 )
-from backend.stages import looks, train
-from backend.stages.linear_fit import LinearConfig, fit_level
 from backend.stages.measurements import Measurements
-from backend.stages.mesh import MeshConfig, extract_mesh, level_set, preview_mesh
-from backend.stages.shared_brightness import ShownPlaces
-from backend.stages.stereo import match_views
-from backend.stages.stereo_config import StereoConfig
+from backend.stages.mesh.extraction import MeshConfig, extract_mesh, level_set, preview_mesh
+from backend.stages.stereo.config import StereoConfig
+from backend.stages.stereo.multi_view_stereo import match_views
 from backend.stages.surface import ShowSurface, Surface, show_nothing
-from backend.stages.train import TrainConfig, fit_surface
+from backend.stages.train import looks, surface_fit
+from backend.stages.train.linear_fit import LinearConfig, fit_level
+from backend.stages.train.shared_brightness import ShownPlaces
+from backend.stages.train.surface_fit import TrainConfig, fit_surface
 from tests.synthetic_scene import (
     CENTRE,
     SIZE,
@@ -404,7 +404,7 @@ def test_the_last_grid_of_a_plain_subject_is_fitted_as_such(monkeypatch: pytest.
         heard.append((len(before), args[2].stereo, 0 if told is None else len(told.weights)))
         return fit_level(scene, before, *args, **words)
 
-    monkeypatch.setattr(train, "fit_level", spy)
+    monkeypatch.setattr(surface_fit, "fit_level", spy)
     monkeypatch.setattr(looks, "textured", lambda scene, distance: 0.35)
     monkeypatch.setattr(looks, "share_told", lambda told, distance: 0.035)
     config = TrainConfig(levels=(16, 20, 24, 32), rounds=(3, 3, 3, 3), steps=(0, 0, 0, 0), looks=(0, 1, 1))
@@ -432,7 +432,7 @@ def test_doubtful_points_count_more_where_most_is_textured(monkeypatch: pytest.M
     def nobody(*field: Any, **how: Any) -> ShownPlaces:
         raise AssertionError("brightness was asked")
 
-    monkeypatch.setattr(train, "fit_level", spy)
+    monkeypatch.setattr(surface_fit, "fit_level", spy)
     config = TrainConfig(levels=(16, 24, 32), rounds=(3, 3, 3), steps=(0, 0, 0), looks=(0, 2, 2))
     usual = LinearConfig()
     assert usual.power_if_textured < usual.confidence_power

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from backend.scene import Camera, transform_points
-from backend.stages.triangulation import two_view_points
+from backend.stages.cameras.triangulation import two_view_points
 
 
 def camera_at(x: float) -> Camera:

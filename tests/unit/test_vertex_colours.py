@@ -9,8 +9,8 @@ import pytest
 from backend.maths.raycast import RayCaster, visible_from
 from backend.maths.srgb import linear_from_srgb, srgb_from_linear
 from backend.scene import Decision, View
-from backend.stages import vertex_colours
-from backend.stages.vertex_colours import colour_vertices
+from backend.stages.mesh import vertex_colours
+from backend.stages.mesh.vertex_colours import colour_vertices
 from tests.synthetic_scene import arc_cameras, photographed, texture_srgb, true_mesh, true_normals
 
 STOPS = np.array([[0.25, 0.2, 0.3], [-0.35, -0.3, -0.4], [0.1, 0.1, 0.1]])
