@@ -186,7 +186,7 @@ class FEWVIEW_PG_settings(bpy.types.PropertyGroup):
         items=[
             ("fast", "Fast", "A first look"),
             ("balanced", "Balanced", "Good for most subjects"),
-            ("detailed", "Detailed", "Two to three times as long, finer colors; for sharp and large photographs"),
+            ("detailed", "Detailed", "Over twice as long, finer colors; for sharp and large photographs"),
             ("nerf", "NeRF", "For comparison: a radiance field, slow and with a rougher mesh"),
             ("neus", "NeuS", "For comparison: a network of distance learned by rendering alone, slow"),
             ("sparsecraft", "SparseCraft", "For comparison: the same with a hash grid and points, slow"),
