@@ -16,7 +16,7 @@ from ..wire.protocol import Cancel, ProtocolError, decode
 
 EXIT_CANCELLED = 130
 """The shell's code for a program ended by Ctrl-C."""
-GRACE_S = 1.5
+GRACE_S = 1.0
 """How long a run whose caller has died may take to end by itself; the promise is 2 s."""
 _CAUGHT = {signal.SIGINT, signal.SIGTERM}
 if sys.platform == "win32":

@@ -357,13 +357,18 @@ def test_a_damaged_checkpoint_is_redone(case: Case) -> None:
         ("internal", 1, "ZeroDivisionError"),
     ],
 )
-def test_trouble_is_told_and_what_was_done_is_kept(case: Case, trouble: str, code: int, words: str) -> None:
+def test_trouble_is_told(case: Case, trouble: str, code: int, words: str) -> None:
     result = case.run(trouble, "stereo")
     assert result.returncode == code
     assert words in result.stderr
     assert ("Traceback" in result.stderr) is (code == 1)
     assert set(case.results()) == {"log.txt"}
     assert "Traceback" in (case.output / "log.txt").read_text()
+    assert case.done() == STAGES[:4]
+
+
+def test_what_was_done_before_trouble_is_kept(case: Case) -> None:
+    assert case.run("memory", "stereo").returncode == 2
     assert case.done() == STAGES[:4]
     assert "Resuming: photos, cameras, region are done" in case.run().stderr
     assert case.done() == STAGES[3:]
