@@ -5,13 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from jaxtyping import Float64
+from jaxtyping import Bool, Float64
 from scipy.ndimage import binary_dilation, binary_erosion
 
 from backend.errors import Cancelled
 from backend.maths.grid import node_positions
 from backend.maths.raycast import camera_rays
-from backend.scene import DepthMap, Ground, StereoResult, no_progress, transform_points
+from backend.scene import Camera, DepthMap, Ground, StereoResult, no_progress, transform_points
 from backend.stages.measurements import carried, measurements
 from backend.stages.stereo.config import StereoConfig
 from backend.stages.stereo.ground import find_ground, without_ground
@@ -165,6 +165,50 @@ def test_pixels_that_show_the_room_behind_are_empty_too(scene: Scene, stereo: St
         assert (map_.empty & body).sum() < 0.01 * body.sum()
         assert not (map_.empty & chance).any()
         assert (map_.empty & room).sum() > 0.45 * room.sum() > 3 * (before.empty & room).sum()
+
+
+@pytest.mark.parametrize("seen_through", [False, True])
+def test_a_spot_amid_the_subject_is_ground_where_that_was_measured(
+    seen_through: bool, scene: Scene, stereo: StereoResult
+) -> None:
+    """Plain cloth agrees with other photographs over any plane, where nothing was measured. Here a painting
+    does that the first photograph shows on the body, or through a hole of the body.
+    """
+    places = [plane_places(view.camera) for view in scene.views]
+    row, column = np.argwhere(scene.coverage[0]).mean(axis=0).astype(int)
+    middle = places[0][row, column]
+    radius = np.quantile(np.linalg.norm(places[0] - middle, axis=2), 0.003)
+    painted = [np.linalg.norm(place - middle, axis=2) < radius for place in places]
+    spot = painted[0]
+    assert (spot <= scene.coverage[0]).all()
+    views, maps = [], []
+    for view, place, where, map_ in zip(scene.views, places, painted, stereo.depth_maps, strict=True):
+        waves = 0.5 + 0.4 * np.prod(np.sin(12 * place / radius), axis=2, keepdims=True)
+        image = np.where(where[..., None], waves, view.image_srgb).astype(np.float32)
+        views.append(replace(view, image_srgb=image))
+        maps.append(map_.measured_where(~where))
+    if seen_through:
+        maps[0] = measured_on_ground(maps[0], scene.views[0].camera, spot)
+    painted_on = replace(stereo, depth_maps=tuple(maps))
+    alone = without_ground(painted_on, tuple(views), true_region(), StereoConfig(), progress=no_progress)
+    assert alone.depth_maps[0].empty is not None
+    share = alone.depth_maps[0].empty[spot].mean()
+    assert share > 0.8 if seen_through else share == 0
+
+
+def measured_on_ground(map_: DepthMap, camera: Camera, where: Bool[np.ndarray, "height width"]) -> DepthMap:
+    origins, directions = camera_rays(camera)
+    along_axis = ground_distance(origins, directions) * (directions @ camera.camera_from_world[2, :3])
+    depth = np.where(where, along_axis.reshape(where.shape) / OBJECT_UNIT, map_.depth).astype(np.float32)
+    return replace(map_, depth=depth, confidence=np.where(where, 1, map_.confidence).astype(np.float32))
+
+
+def plane_places(camera: Camera) -> Float64[np.ndarray, "height width 2"]:
+    """Where each pixel's ray meets the ground, in the world; far off where it does not."""
+    origins, directions = camera_rays(camera)
+    distance = np.nan_to_num(ground_distance(origins, directions), posinf=1e3)
+    met: Float64[np.ndarray, "rays 3"] = origins + distance[:, None] * directions
+    return met[:, :2].reshape(camera.height, camera.width, 2)
 
 
 @pytest.mark.parametrize("scale", [1.0, 1.5])

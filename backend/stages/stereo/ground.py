@@ -20,7 +20,7 @@ from scipy.ndimage import (
     label,
     uniform_filter,
 )
-from skimage.segmentation import watershed
+from skimage.segmentation import expand_labels, watershed
 
 from ...maths.geometry import Pinhole, pixel_centres, ray_directions, seen_places
 from ...maths.plane_fit import plane_under_most
@@ -70,6 +70,10 @@ _BEHIND_INSIDE_PX = 2
 """From the border of what shows the room behind, which is found where photographs are small."""
 _LEAST_SHOWN, _LEAST_STANDING, _LEAST_BEHIND = 1e-3, 2e-4, 5e-3
 """Of the picture: smaller pieces of ground, of what stands on it, and of the room behind are chance."""
+_SPOT_RING_PX, _SPOT_SHARE = 3, 0.1
+"""Of what lies so near around a small piece of ground: more, standing there, makes it doubtful; and of its
+own pixels: less, measured as ground or behind, makes it none. Of nine photographs of a doll seven pieces of
+0.03 to 0.3 % are such, all of them cloth; of three tables' 21 none."""
 _INSIDE_PX, _OUTSIDE_PX = 4, 6
 """From the border of what agrees: so far inside pixels surely show the ground, and so far outside they are
 not known to, for a patch that reaches over the subject's outline agrees or not by chance. Between them the
@@ -186,6 +190,7 @@ def _without(
     behind = binary_erosion(behind, iterations=_BEHIND_INSIDE_PX, border_value=1)
     closed = binary_closing(ground_shown | behind, iterations=_GAP_PX)
     empty = _up_to_edges(_without_specks(closed & ~standing, _LEAST_SHOWN), standing, image_srgb)
+    empty = _without_plain_spots(empty, standing, told=(known & low) | textured_and_behind[1])
     return replace(
         map_.measured_where(~low & ~empty),
         empty=empty if map_.empty is None else empty | map_.empty,
@@ -225,6 +230,26 @@ def _up_to_edges(
         edges, np.where(inside, 1, np.where(outside, 2, 0))
     )
     return np.asarray(parts == 1)
+
+
+def _without_plain_spots(
+    empty: Bool[np.ndarray, "height width"],
+    standing: Bool[np.ndarray, "height width"],
+    told: Bool[np.ndarray, "height width"],
+) -> Bool[np.ndarray, "height width"]:
+    """Without small pieces beside what stands there in which next to nothing is `told` by a depth.
+
+    Plain cloth between two seams agrees with itself over any plane; ground that is seen through the gap of an
+    arm is measured.
+    """
+    piece, _ = label(empty)
+    around = np.where(empty, 0, expand_labels(piece, _SPOT_RING_PX))  # type: ignore[no-untyped-call]
+    size, num_around = np.bincount(piece.ravel()), np.bincount(around.ravel(), minlength=piece.max() + 1)
+    num_told = np.bincount(piece.ravel(), told.ravel())
+    num_standing = np.bincount(around.ravel(), standing.ravel(), minlength=len(size))
+    small = size < _LEAST_BEHIND * empty.size
+    plain = small & (num_told < _SPOT_SHARE * size) & (num_standing > _SPOT_SHARE * num_around)
+    return np.asarray(empty & ~plain[piece])
 
 
 def _without_specks(mask: Bool[np.ndarray, "height width"], least: float) -> Bool[np.ndarray, "height width"]:
