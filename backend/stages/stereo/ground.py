@@ -73,7 +73,7 @@ _LEAST_SHOWN, _LEAST_STANDING, _LEAST_BEHIND = 1e-3, 2e-4, 5e-3
 _SPOT_RING_PX, _SPOT_SHARE = 3, 0.1
 """Of what lies so near around a small piece of ground: more, standing there, makes it doubtful; and of its
 own pixels: less, measured as ground or behind, makes it none. Of nine photographs of a doll six pieces of
-0.04 to 0.33 % are such, five of them its cloth; of three tables' 21 none."""
+0.04 to 0.33 % are such, five of them its cloth; of 21 photographs of tables none."""
 _INSIDE_PX, _OUTSIDE_PX = 4, 6
 """From the border of what agrees: so far inside pixels surely show the ground, and so far outside they are
 not known to, for a patch that reaches over the subject's outline agrees or not by chance. Between them the
