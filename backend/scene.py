@@ -280,7 +280,7 @@ class StereoResult:
     ground: Ground | None = None
     """Left out of points and depth maps; None where it is not, or there is none."""
     doubt: str | None = None
-    """For a person: what was asked for and could not be done; None if nothing was."""
+    """For a person: what was asked for and could not be done, or could be asked for; None if nothing is."""
     decisions: tuple[Decision, ...] = ()
 
 

@@ -1,9 +1,12 @@
-"""Where a camera shows points of the world: numpy, float64; maths/geometry.py does the same in torch."""
+"""Where cameras show points of the world: numpy, float64; maths/geometry.py does the same in torch."""
+
+from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Bool, Float, Float64
 
 from ..scene import Camera, transform_points
+from .upright import up_direction
 
 
 def projected(
@@ -31,3 +34,9 @@ def shown(
     """The same of points that have been projected."""
     within = (pixels >= 0) & (pixels < [camera.width, camera.height])
     return np.asarray(within.all(axis=1) & (depth > 0))
+
+
+def up_of(cameras: Sequence[Camera]) -> Float64[np.ndarray, "3"]:
+    """Unit vector of the world that is up, for photographs held upright, as Blender has it."""
+    rights, bottoms, forwards = np.stack([camera.camera_from_world[:3, :3] for camera in cameras], axis=1)
+    return up_direction(rights, -bottoms, -forwards)

@@ -11,8 +11,8 @@ from markupsafe import Markup
 from PIL import Image
 
 from ..images import resized
+from ..maths.projection import up_of
 from ..scene import Region, View
-from .pictures import up_of
 
 _THUMBNAIL_PX = 96
 _GRAPH_WIDTH, _GRAPH_HEIGHT = 720, 640

@@ -14,9 +14,9 @@ from jaxtyping import Bool, Float, Float32, Float64
 from PIL import Image
 
 from ..images import resized
+from ..maths.projection import up_of
 from ..maths.raycast import MeshImage
 from ..maths.srgb import srgb_from_linear
-from ..maths.upright import up_direction
 from ..scene import Camera
 
 JPEG_QUALITY = 86
@@ -125,12 +125,6 @@ def turntable_cameras(
         backwards = np.cos(elevation) * level + np.sin(elevation) * up
         found.append(_looking_at(centre, centre + distance * backwards, up, size_px))
     return tuple(found)
-
-
-def up_of(cameras: Sequence[Camera]) -> Float64[np.ndarray, "3"]:
-    """Unit vector of the world that is up, for photographs held upright, as Blender has it."""
-    rights, bottoms, forwards = np.stack([camera.camera_from_world[:3, :3] for camera in cameras], axis=1)
-    return up_direction(rights, -bottoms, -forwards)
 
 
 def _looking_at(

@@ -14,7 +14,7 @@ from backend.maths.raycast import camera_rays
 from backend.scene import Camera, DepthMap, Ground, StereoResult, no_progress, transform_points
 from backend.stages.measurements import carried, measurements
 from backend.stages.stereo.config import StereoConfig
-from backend.stages.stereo.ground import find_ground, without_ground
+from backend.stages.stereo.ground import find_ground, told_of_ground, without_ground
 from backend.stages.train.silhouettes import least_distance
 from tests.synthetic_scene import (
     CENTRE,
@@ -236,6 +236,31 @@ def test_masks_say_what_the_subject_is(scene: Scene, stereo: StereoResult) -> No
     assert kept.doubt is not None
     assert "the photographs have masks" in kept.doubt
     assert kept.points is stereo.points
+
+
+def test_ground_that_is_kept_is_told(scene: Scene, stereo: StereoResult) -> None:
+    told = told_of_ground(stereo, scene.views, true_region())
+    assert told.doubt is not None
+    assert "Without Ground" in told.doubt
+    assert [(d.what, d.choice) for d in told.decisions] == [("ground", "kept")]
+    assert (told.points, told.depth_maps, told.ground) == (stereo.points, stereo.depth_maps, None)
+
+
+def test_no_ground_is_told_of_that_masks_leave_out(scene: Scene, stereo: StereoResult) -> None:
+    views = tuple(replace(view, mask=np.ones_like(view.image_srgb[..., 0])) for view in scene.views)
+    assert told_of_ground(stereo, views, true_region()) is stereo
+
+
+def test_a_wall_is_no_ground_to_be_told_of(scene: Scene, stereo: StereoResult) -> None:
+    """The same photographs, taken with the camera on its side."""
+    on_its_side = np.array([[0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]], np.float64)
+    views = [
+        replace(
+            view, camera=replace(view.camera, camera_from_world=on_its_side @ view.camera.camera_from_world)
+        )
+        for view in scene.views
+    ]
+    assert told_of_ground(stereo, tuple(views), true_region()) is stereo
 
 
 def test_without_ground_nothing_changes_but_the_user_is_told(scene: Scene, stereo: StereoResult) -> None:

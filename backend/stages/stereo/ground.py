@@ -7,6 +7,7 @@ says what one off a mask says: along its ray there is nothing of the subject. So
 lies behind the region, as stereo found.
 """
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -22,8 +23,10 @@ from scipy.ndimage import (
 )
 from skimage.segmentation import expand_labels, watershed
 
+from ...maths.angles import angles_between
 from ...maths.geometry import Pinhole, pixel_centres, ray_directions, seen_places
 from ...maths.plane_fit import plane_under_most
+from ...maths.projection import up_of
 from ...scene import (
     Decision,
     DepthMap,
@@ -54,6 +57,9 @@ _LEAST_ABOVE = 0.02
 """Of the sure points: less, and there is no subject on it."""
 _SPREADS = 3.0
 """Heights up to so many standard deviations of the ground's own are the ground's."""
+_MOST_TILTED_DEG = 20.0
+"""From level, for ground to be spoken of. Measured: tables and rugs 0.4 to 3, walls and what photographs that
+were taken on the side show 71 to 91."""
 _FINEST = 0.005
 """Of the region's radius: lower is the ground's, however flat that is."""
 
@@ -96,8 +102,7 @@ def without_ground(
     """
     if all(view.mask is not None for view in views):
         return _as_it_is(stereo, "the photographs have masks, which say what the subject is")
-    eyes = np.array([view.camera.position for view in views])
-    ground, because = find_ground(stereo.points, transform_points(region.object_from_world, eyes))
+    ground, because = _ground_before(views, region, stereo.points)
     if ground is None:
         return _as_it_is(stereo, because)
     points = stereo.points
@@ -123,6 +128,35 @@ def _as_it_is(stereo: StereoResult, because: str) -> StereoResult:
     decision = Decision(what="ground", choice="none to leave out", because=because)
     doubt = f"There is no flat ground to leave out: {because}."
     return replace(stereo, doubt=doubt, decisions=(*stereo.decisions, decision))
+
+
+def told_of_ground(stereo: StereoResult, views: tuple[View, ...], region: Region) -> StereoResult:
+    """With a word about ground that is kept, where photographs without masks show something stand on it.
+
+    Only what is level counts: a wall is a plane with things before it as well.
+    """
+    if all(view.mask is not None for view in views):
+        return stereo
+    ground, because = _ground_before(views, region, stereo.points)
+    if ground is None:
+        return stereo
+    up = region.object_from_world[:3, :3] @ up_of([view.camera for view in views])
+    if angles_between(up / np.linalg.norm(up), ground.normal) > math.radians(_MOST_TILTED_DEG):
+        return stereo
+    doubt = "What was photographed stands on something flat, which becomes part of the mesh. "
+    doubt += "To leave that out, choose Without Ground, or --without-ground in a terminal."
+    return replace(
+        stereo,
+        doubt=doubt,
+        decisions=(*stereo.decisions, Decision(what="ground", choice="kept", because=because)),
+    )
+
+
+def _ground_before(
+    views: tuple[View, ...], region: Region, points: SurfacePoints
+) -> tuple[Ground | None, str]:
+    eyes = np.array([view.camera.position for view in views])
+    return find_ground(points, transform_points(region.object_from_world, eyes))
 
 
 def find_ground(points: SurfacePoints, eyes: Float64[np.ndarray, "views 3"]) -> tuple[Ground | None, str]:

@@ -8,7 +8,7 @@ import torch
 from ...scene import Progress, Region, SolvedCameras, StereoResult
 from .camera_refinement import find_patches, misplaced_px, refine_cameras, with_cameras, with_refined
 from .config import StereoConfig
-from .ground import without_ground
+from .ground import told_of_ground, without_ground
 from .multi_view_stereo import match_views, unmatched
 
 
@@ -43,5 +43,5 @@ def match_solved(
         beside_lines_px = misplaced_px([view.camera for view in solved.views], seen)
         found = replace(found, beside_lines_px=beside_lines_px)
     if not config.without_ground:
-        return found
+        return told_of_ground(found, with_refined(solved, found).views, region)
     return without_ground(found, with_refined(solved, found).views, region, config, progress=progress)
