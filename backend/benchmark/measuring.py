@@ -201,7 +201,8 @@ def reconstruct_words(trial: Trial, output: Path) -> tuple[str, ...]:
         options["--budget-seconds"] = f"{trial.budget_s:g}"
     images = (str(path) for path in image_paths(case, folder, case.given))
     words = (word for option in options.items() for word in option)
-    return ("reconstruct", *images, *words, "--output", str(output.absolute()))
+    alone = ("--without-ground",) if case.without_ground else ()
+    return ("reconstruct", *images, *words, *alone, "--output", str(output.absolute()))
 
 
 def report_numbers(report: Mapping[str, Any]) -> dict[str, float | None]:

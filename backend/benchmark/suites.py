@@ -3,7 +3,7 @@
 Standard library only: Blender's Python reads it to render the scenes.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
 
@@ -39,6 +39,8 @@ class Case:
     truth: str | None = None
     surroundings: str | None = None
     """The true mesh of what is in the pictures beside the subject; not part of `truth`."""
+    without_ground: bool = False
+    """Reconstructed so; then the whole mesh counts, against the subject alone."""
     rendering: Rendering | None = None
     """None for real photographs."""
 
@@ -135,6 +137,12 @@ def rendered_case(
     )
 
 
+def _alone(case: Case) -> Case:
+    """The same photographs, without the ground."""
+    scene, num_given = case.name.rsplit("_", 1)
+    return replace(case, name=f"{scene}_alone_{num_given}", without_ground=True)
+
+
 _SCENES = ("monkey", "glossy", "plaster", "thin", "genus2", "spots", "house")
 _MESHES = (
     # The cow looks the other way and is nearly white.
@@ -214,6 +222,7 @@ SUITES = MappingProxyType(
                 cases=(
                     *(rendered_case(scene, count) for scene in _SCENES for count in _NUM_VIEWS),
                     *(rendered_case("table", n, surroundings="surroundings.ply") for n in _NUM_VIEWS),
+                    *(_alone(rendered_case("table", n)) for n in _NUM_VIEWS),
                     *(
                         rendered_case(path, count, name=name, words=words)
                         for name, path, words in _MESHES

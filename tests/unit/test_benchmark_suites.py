@@ -34,6 +34,17 @@ def test_what_is_held_out_is_not_given(case: Case, tmp_path: Path) -> None:
     assert not held_out & words
 
 
+def test_a_subject_without_its_ground_is_of_the_same_photographs(tmp_path: Path) -> None:
+    cases = {case.name: case for case in CASES}
+    words = []
+    for name in ("table_6", "table_alone_6"):
+        folder = filled(cases[name], tmp_path / name, 24)
+        trial = Trial(case=cases[name], folder=folder, preset="fast", seed=3, device="cpu")
+        words.append([word.replace(name, "") for word in reconstruct_words(trial, tmp_path / "out")])
+    assert [word for word in words[1] if word not in words[0]] == ["--without-ground"]
+    assert cases["table_alone_6"].folder == "table_6"
+
+
 @pytest.mark.parametrize("name", SUITES)
 def test_cases_of_a_suite_have_names_of_their_own(name: str) -> None:
     names = [case.name for case in SUITES[name].cases]
