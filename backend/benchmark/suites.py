@@ -137,12 +137,6 @@ def rendered_case(
     )
 
 
-def _alone(case: Case) -> Case:
-    """The same photographs, without the ground."""
-    scene, num_given = case.name.rsplit("_", 1)
-    return replace(case, name=f"{scene}_alone_{num_given}", without_ground=True)
-
-
 _SCENES = ("monkey", "glossy", "plaster", "thin", "genus2", "spots", "house")
 _MESHES = (
     # The cow looks the other way and is nearly white.
@@ -222,7 +216,10 @@ SUITES = MappingProxyType(
                 cases=(
                     *(rendered_case(scene, count) for scene in _SCENES for count in _NUM_VIEWS),
                     *(rendered_case("table", n, surroundings="surroundings.ply") for n in _NUM_VIEWS),
-                    *(_alone(rendered_case("table", n)) for n in _NUM_VIEWS),
+                    *(
+                        replace(rendered_case("table", n), name=f"table_alone_{n}", without_ground=True)
+                        for n in _NUM_VIEWS
+                    ),
                     *(
                         rendered_case(path, count, name=name, words=words)
                         for name, path, words in _MESHES

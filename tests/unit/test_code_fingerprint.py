@@ -1,27 +1,16 @@
 """What is kept under the code's fingerprint is done again after any change of what computes it."""
 
-import ast
 from pathlib import Path
 
 import pytest
 
 from backend import provenance
 from backend.benchmark import measuring
+from tests.backend_imports import imported_by
 
 BACKEND = Path(provenance.__file__).parent
 NOT_KEPT = {BACKEND / "stages" / "report.py", BACKEND / "stages" / "cameras" / "camera_report.py"}
 """Done in every run: what only they use changes nothing that is kept."""
-
-
-def imported_by(source: Path) -> set[Path]:
-    """The files of the backend that a module names in its imports."""
-    found: set[Path] = set()
-    for node in ast.walk(ast.parse(source.read_text(encoding="utf-8"))):
-        if isinstance(node, ast.ImportFrom) and node.level:
-            place = source.parents[node.level - 1].joinpath(*(node.module or "").split("."))
-            named = [place.with_suffix(".py"), *(place / f"{alias.name}.py" for alias in node.names)]
-            found |= {path for path in named if path.is_file()}
-    return found
 
 
 def reached_from(sources: set[Path]) -> set[Path]:

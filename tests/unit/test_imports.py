@@ -1,26 +1,19 @@
 """Imports run one way, as docs/architecture.md says: no part of the backend asks one that stands on it."""
 
-import ast
 from graphlib import TopologicalSorter
 from pathlib import Path
 
 import pytest
 
 import backend
+from tests.backend_imports import imported_by
 
 BACKEND = Path(backend.__file__).parent
 
 
 def imports_of(source: Path) -> set[Path]:
-    """What a module imports from the backend: paths below it, without suffixes."""
-    found: set[Path] = set()
-    for node in ast.walk(ast.parse(source.read_text(encoding="utf-8"))):
-        if isinstance(node, ast.ImportFrom) and node.level:
-            place = source.parents[node.level - 1].joinpath(*(node.module or "").split("."))
-            inside = {place / alias.name for alias in node.names}
-            modules = {path for path in inside if path.with_suffix(".py").is_file() or path.is_dir()}
-            found |= modules or {place}
-    return {path.relative_to(BACKEND) for path in found}
+    """Paths below the backend, without suffixes."""
+    return {path.relative_to(BACKEND).with_suffix("") for path in imported_by(source)}
 
 
 def modules_in(folder: str) -> list[Path]:

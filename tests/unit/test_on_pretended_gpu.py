@@ -78,9 +78,8 @@ def test_stereo_and_fit_run_on_a_gpu_as_on_the_cpu(
     scene: Callable[[], Scene], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Compiled and not, they round differently; a cell of 48 nodes is 0.04 of the frame's units."""
-    monkeypatch.setattr(
-        "backend.stages.train.looks.MOSTLY_TEXTURED", 1.0
-    )  # so that brightness is asked as well
+    # so that brightness is asked as well
+    monkeypatch.setattr("backend.stages.train.looks.MOSTLY_TEXTURED", 1.0)
     config = TrainConfig(
         levels=(32, 48), rounds=(4, 4), steps=(0, 2), looks=(0, 2, 2), render=RenderConfig(rays=64)
     )

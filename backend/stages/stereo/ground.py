@@ -100,9 +100,7 @@ def without_ground(
 
     The views' cameras are those that the depth maps belong to. A decision says what was found.
     """
-    if all(view.mask is not None for view in views):
-        return _as_it_is(stereo, "the photographs have masks, which say what the subject is")
-    ground, because = _ground_before(views, region, stereo.points)
+    ground, because = _unmasked_ground(stereo.points, views, region)
     if ground is None:
         return _as_it_is(stereo, because)
     points = stereo.points
@@ -135,9 +133,7 @@ def told_of_ground(stereo: StereoResult, views: tuple[View, ...], region: Region
 
     Only what is level counts: a wall is a plane with things before it as well.
     """
-    if all(view.mask is not None for view in views):
-        return stereo
-    ground, because = _ground_before(views, region, stereo.points)
+    ground, because = _unmasked_ground(stereo.points, views, region)
     if ground is None:
         return stereo
     up = region.object_from_world[:3, :3] @ up_of([view.camera for view in views])
@@ -152,9 +148,12 @@ def told_of_ground(stereo: StereoResult, views: tuple[View, ...], region: Region
     )
 
 
-def _ground_before(
-    views: tuple[View, ...], region: Region, points: SurfacePoints
+def _unmasked_ground(
+    points: SurfacePoints, views: tuple[View, ...], region: Region
 ) -> tuple[Ground | None, str]:
+    """As `find_ground`, where masks do not tell the subject already."""
+    if all(view.mask is not None for view in views):
+        return None, "the photographs have masks, which say what the subject is"
     eyes = np.array([view.camera.position for view in views])
     return find_ground(points, transform_points(region.object_from_world, eyes))
 

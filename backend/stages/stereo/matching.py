@@ -42,6 +42,7 @@ def match_solved(
             seen = find_patches(solved.views, region, found.points, device=device)
         beside_lines_px = misplaced_px([view.camera for view in solved.views], seen)
         found = replace(found, beside_lines_px=beside_lines_px)
+    views = with_refined(solved, found).views
     if not config.without_ground:
-        return told_of_ground(found, with_refined(solved, found).views, region)
-    return without_ground(found, with_refined(solved, found).views, region, config, progress=progress)
+        return told_of_ground(found, views, region)
+    return without_ground(found, views, region, config, progress=progress)
