@@ -50,15 +50,16 @@ def reconstruct(
     device: str = "auto",
     seed: int = 0,
     region: tuple[tuple[float, float, float], float] | None = None,
+    cut_out: bool = False,
     without_ground: bool = False,
 ) -> Reconstruction:
     """Reconstruct from image files or folders, wait, and bring the mesh into the scene.
 
     The job gets a folder of its own in `output`, and goes on in it where just this job was stopped.
     `cameras` are known ones: a transforms.json or a COLMAP model; `region` is a centre and a radius in their
-    frame; `without_ground` leaves out the flat ground that the subject stands on. Nothing is taken from the
-    panel. Raises JobError where nothing can be started, ValueError for arguments that make no sense,
-    ReconstructionFailed where the backend gives up.
+    frame; `cut_out` cuts the subject out of photographs without masks; `without_ground` leaves out the flat
+    ground that it stands on. Nothing is taken from the panel. Raises JobError where nothing can be started,
+    ValueError for arguments that make no sense, ReconstructionFailed where the backend gives up.
     """
     python, reason = backend_python_or_reason(bpy.context)
     reason = reason_against_changes(bpy.context.scene) or reason
@@ -77,6 +78,7 @@ def reconstruct(
         seed=seed,
         region_centre=centre,
         region_radius=radius,
+        cut_out=cut_out,
         without_ground=without_ground,
         keep_stages=False,
     )

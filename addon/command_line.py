@@ -58,6 +58,7 @@ def _reconstruct(asked: argparse.Namespace) -> dict[str, object]:
         masks=asked.masks,
         truth=asked.truth,
         preset=asked.preset,
+        cut_out=asked.cut_out,
         without_ground=asked.without_ground,
         device=asked.device,
         seed=asked.seed,
@@ -111,6 +112,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--masks", type=Path, help="folder with an image per photograph, white on the subject")
     add("--truth", type=Path, help="mesh file to measure the result against")
     add("--preset", choices=PRESETS, default="balanced", help="speed against detail (balanced)")
+    add("--cut-out", action="store_true", help="cut the subject out of photographs without masks")
     add("--without-ground", action="store_true", help="leave out the flat ground that the subject stands on")
     add("--device", choices=DEVICES, default="auto", help="where to compute (auto)")
     add("--seed", type=int, default=0, help="random seed (0)")

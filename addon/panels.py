@@ -203,6 +203,7 @@ class FEWVIEW_PT_reconstruct(_Step, bpy.types.Panel):
         layout, settings = self.layout, settings_of(context)
         draw_state(layout, self.state(context))
         layout.prop(settings, "preset")
+        layout.prop(settings, "cut_out")
         layout.prop(settings, "without_ground")
         ready = self.state(context).icon != TODO
         row = layout.row()

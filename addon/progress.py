@@ -3,6 +3,7 @@
 STAGE_SECONDS = {
     "photos": 1.0,
     "cameras": 4.0,
+    "cutout": 15.0,
     "region": 0.5,
     "stereo": 5.0,
     "train": 9.0,
@@ -18,6 +19,7 @@ STAGE_SECONDS = {
 
 _RUNS = (
     ("photos", "cameras", "region", "stereo", "train", "mesh", "report"),
+    ("photos", "cameras", "cutout", "region", "stereo", "train", "mesh", "report"),
     ("points", "surface", "mesh"),
     ("python", "packages", "check"),
 )
@@ -26,6 +28,7 @@ _RUNS = (
 STAGE_WORDS = {
     "photos": "Reading photographs",
     "cameras": "Placing cameras",
+    "cutout": "Cutting out the subject",
     "region": "Finding the subject",
     "stereo": "Comparing photographs",
     "train": "Fitting the surface",
@@ -54,7 +57,8 @@ def total_share(stages_before: list[str], stage: str, num_left: int, fraction: f
     done = sum(_seconds(name) for name in stages_before)
     this = _seconds(stage)
     num_left = min(max(num_left, 0), _MOST_STAGES)
-    following = next((run[run.index(stage) + 1 :] for run in _RUNS if stage in run), ())
+    rests = [run[run.index(stage) + 1 :] for run in _RUNS if stage in run]
+    following = next((rest for rest in rests if len(rest) == num_left), rests[0] if rests else ())
     left = sum(_seconds(name) for name in following[:num_left]) + max(num_left - len(following), 0)
     return min(max((done + fraction * this) / (done + this + left), 0.0), 1.0)
 

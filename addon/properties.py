@@ -195,6 +195,14 @@ class FEWVIEW_PG_settings(bpy.types.PropertyGroup):
         ],
         default="balanced",
     )
+    cut_out: BoolProperty(
+        name="Cut Out Subject",
+        description=(
+            "Keep only what stands out in the photographs, where they have no masks. The network that "
+            "tells it is fetched from the internet once (179 MB)"
+        ),
+        default=False,
+    )
     without_ground: BoolProperty(
         name="Without Ground",
         description="Leave out the flat ground that the subject stands on. Masks do that by themselves",

@@ -22,8 +22,8 @@ from .waiting import set_waiting_policy
 from .wire.environment import BUILDS
 from .wire.protocol import DEVICES, PRESETS, PROTOCOL_VERSION, Job
 
-_JOB_OPTIONS = ("output", "cameras", "masks", "preset", "device", "seed", "truth", "without_ground")
-_CAMERA_OPTIONS = ("output", "cameras", "masks", "preset", "seed")
+_CAMERA_OPTIONS = ("output", "cameras", "masks", "cut_out", "preset", "seed")
+_JOB_OPTIONS = (*_CAMERA_OPTIONS, "device", "truth", "without_ground")
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -134,6 +134,7 @@ def _parser() -> argparse.ArgumentParser:
         metavar=("X", "Y", "Z", "RADIUS"),
         help="sphere to reconstruct, in the frame of the cameras; else it is found",
     )
+    _add_cut_out(reconstruct)
     add(
         "--without-ground",
         action="store_true",
@@ -173,8 +174,18 @@ def _add_cameras(parser: argparse.ArgumentParser) -> None:
     add("--output", metavar="DIR", required=True, help="folder of the results, as for reconstruct")
     add("--cameras", metavar="FILE_OR_FOLDER", help="cameras to be looked at; else they are estimated")
     add("--masks", metavar="FOLDER", help="an image per photograph, white on the subject")
+    _add_cut_out(parser)
     add("--preset", choices=PRESETS, help="of a reconstruction that is to go on from here (balanced)")
     add("--seed", type=seed, metavar="N", help="random seed (0)")
+
+
+def _add_cut_out(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--cut-out",
+        action="store_true",
+        default=None,  # as of the options above: not asked for
+        help="cut the subject out of photographs without masks, by a network that is fetched once (179 MB)",
+    )
 
 
 def _add_install(parser: argparse.ArgumentParser) -> None:

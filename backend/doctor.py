@@ -33,6 +33,8 @@ DEPENDENCIES = {
     "rich": "rich",
     "jinja2": "jinja2",
     "jaxtyping": "jaxtyping",
+    "onnxruntime": "onnxruntime",
+    "pooch": "pooch",
 }
 """Import name of each needed package, with its name for pip."""
 

@@ -20,6 +20,7 @@ class ErrorCode(StrEnum):
     OUTPUT_UNUSABLE = "output_unusable"
     SETTINGS_INVALID = "settings_invalid"
     TRUTH_UNREADABLE = "truth_unreadable"
+    NETWORK_UNAVAILABLE = "network_unavailable"
     CLOUD_UNUSABLE = "cloud_unusable"
     MISSING_DEPENDENCY = "missing_dependency"
     DEVICE_UNAVAILABLE = "device_unavailable"

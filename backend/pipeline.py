@@ -25,12 +25,13 @@ from .presets import Settings
 from .previews import Previews
 from .provenance import code_fingerprint, versions
 from .results import cameras_summary, check_no_mesh_of_others, summary, write_all, write_cameras
-from .scene import Decision, Photo, Region, SolvedCameras, StereoResult, SurfaceMesh, View
+from .scene import CutOut, Decision, Photo, Region, SolvedCameras, StereoResult, SurfaceMesh, View
 from .stages.cameras.camera_report import build_camera_report
 from .stages.cameras.confirmation import unconfirmed
 from .stages.cameras.copies import copies_apart_text
 from .stages.cameras.known_cameras import cameras_source, may_be_unturned
 from .stages.cameras.solving import solve_cameras
+from .stages.cutout.cutting_out import cut_out, with_cut_out
 from .stages.mesh.extraction import extract_mesh
 from .stages.mesh.originals import Original
 from .stages.photos import (
@@ -57,9 +58,9 @@ from .wire.photographs import passed_over, passed_over_text
 from .workspace import StageCost, Workspace, check_free_space, content_of, fingerprint
 
 T = typing.TypeVar("T")
-CHECKPOINTED = ("photos", "cameras", "region", "stereo", "train", "mesh")
+CHECKPOINTED = ("photos", "cameras", "cutout", "region", "stereo", "train", "mesh")
 STAGE_NAMES = (*CHECKPOINTED, "report")
-_UNTIL = {"cameras": ("photos", "cameras", "region"), "report": STAGE_NAMES}
+_UNTIL = {"cameras": ("photos", "cameras", "cutout", "region"), "report": STAGE_NAMES}
 """The stages of a run, by what it is asked for."""
 _CAMERA_FILES = frozenset({".json", ".txt", ".bin"})
 _BYTES_PER_PIXEL = MappingProxyType({"photos": 16, "cameras": 24, "stereo": 40})
@@ -85,6 +86,8 @@ class Job:
     seed: int = 0
     truth: Path | None = None
     """A mesh to measure the result against."""
+    cut_out: bool = False
+    """Whether the subject is cut out of photographs without masks."""
     until: str = "report"
     """"cameras" to end when cameras and region are known; a later run of the whole goes on from there."""
 
@@ -115,6 +118,7 @@ class Stages:
 
     load_photos: Callable[..., tuple[Photo, ...]] = load_photos
     solve_cameras: Callable[..., SolvedCameras] = solve_cameras
+    cut_out: Callable[..., CutOut] = cut_out
     find_region: Callable[..., Region] = find_region
     match_views: Callable[..., StereoResult] = match_solved
     fit_surface: Callable[..., Surface] = fit_by_settings
@@ -242,7 +246,7 @@ def run(job: Job, workspace: Workspace, *, settings: Settings, stages: Stages, l
     workspace.claim("photographs", files.photo_contents.values())
     if job.until == "cameras":
         check_no_mesh_of_others(workspace, frame)
-    names = _UNTIL[job.until]
+    names = _stage_names(job)
     finished = _finished(workspace, fingerprints, names)
     if finished:
         listener.resumed(finished)
@@ -264,6 +268,10 @@ def run(job: Job, workspace: Workspace, *, settings: Settings, stages: Stages, l
     )
     report = this.unkept_stage("report", partial(stages.build_report, inputs, settings.report))
     return Outcome(files=write_all(report, radiance, workspace, frame=frame), summary=summary(report))
+
+
+def _stage_names(job: Job) -> tuple[str, ...]:
+    return tuple(name for name in _UNTIL[job.until] if job.cut_out or name != "cutout")
 
 
 def _files(job: Job) -> _Files:
@@ -319,10 +327,19 @@ def _placed(
     if doubt := unconfirmed(solved):
         this.warn(doubt)
     del photos, solve  # the views hold what is needed of them
+    solved = _cut_out(solved, this, stages) if job.cut_out else solved
     region = this.stage("region", partial(stages.find_region, solved, settings.region))
     if region.doubt:
         this.warn(region.doubt)
     return solved, region
+
+
+def _cut_out(solved: SolvedCameras, this: _Run, stages: Stages) -> SolvedCameras:
+    """With masks where there were none."""
+    cut = this.stage("cutout", partial(stages.cut_out, solved))
+    if cut.doubt:
+        this.warn(cut.doubt)
+    return with_cut_out(solved, cut)
 
 
 def _reconstructed(
@@ -387,6 +404,7 @@ def stage_fingerprints(job: Job, files: _Files, settings: Settings, device_kind:
             settings.photos,
         ),
         "cameras": (*_camera_files(job.cameras), job.seed, settings.cameras),
+        "cutout": (job.cut_out,),
         "region": (settings.region,),
         "stereo": (device_kind, settings.stereo),
         "train": (settings.train,),

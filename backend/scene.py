@@ -14,6 +14,9 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Float64, Int64, UInt8
 
+Mask = Float32[np.ndarray, "height width"]
+"""1 on the subject, 0 off it."""
+
 Progress = Callable[[float, str], None]
 """Called with the share of the stage that is done (0 to 1) and a few words; may raise Cancelled."""
 
@@ -163,10 +166,23 @@ class SolvedCameras:
     """Mean over the sparse points, in pixels of the photographs as placed; None where not estimated."""
     evidence: CameraEvidence | None = None
     """None where the cameras were given."""
+    masks_cut_out: bool = False
+    """Whether FewView made masks of its own, which show the subject to a pixel or two and no finer."""
     suit_outlines: bool = False
     """Whether estimated cameras were moved until the subject's outlines suit each other."""
     way_up_told: bool = False
     """Whether the photographs told which way up given cameras are."""
+    decisions: tuple[Decision, ...] = ()
+
+
+@dataclass(frozen=True, kw_only=True)
+class CutOut:
+    """Masks that FewView made."""
+
+    masks: tuple[Mask | None, ...]
+    """One per view; None for one that has a mask already, or whose mask would contradict the others."""
+    doubt: str | None = None
+    """For a person: where the subject could not be cut out, and what helps; None if it could everywhere."""
     decisions: tuple[Decision, ...] = ()
 
 

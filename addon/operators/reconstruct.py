@@ -102,6 +102,7 @@ class FEWVIEW_OT_reconstruct(bpy.types.Operator):
     )
     masks: argument("masks")
     preset: argument("preset")
+    cut_out: argument("cut_out")
     without_ground: argument("without_ground")
     device: argument("device")
     seed: argument("seed")
@@ -122,7 +123,8 @@ class FEWVIEW_OT_reconstruct(bpy.types.Operator):
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         """Start; without a window, wait for the end."""
-        same = ("preset", "without_ground", "device", "seed", *(() if self.images else ("masks", "truth")))
+        of_files = () if self.images else ("masks", "truth")
+        same = ("preset", "cut_out", "without_ground", "device", "seed", *of_files)
         fill_in(self, settings_of(context), {name: name for name in same})
         python, reason = backend_python_or_reason(context)
         try:
@@ -161,6 +163,7 @@ class FEWVIEW_OT_reconstruct(bpy.types.Operator):
             truth=absolute(self.truth) if self.truth else None,
             region_centre=centre,
             region_radius=radius,
+            cut_out=self.cut_out,
             without_ground=self.without_ground,
             keep_stages=False,
         )

@@ -161,6 +161,7 @@ def resolve(job: protocol.Job, base: Path) -> "Job":
         device=job.device,
         seed=job.seed,
         truth=path_or_none(job.truth),
+        cut_out=job.cut_out,
         until=job.until,
     )
 

@@ -12,6 +12,7 @@ STAGE_TEXTS = MappingProxyType(
     {
         "photos": "Reading the photographs",
         "cameras": "Finding where each was taken",
+        "cutout": "Cutting out the subject",
         "region": "Finding the subject",
         "stereo": "Measuring points",
         "train": "Fitting the surface",

@@ -17,7 +17,7 @@ from scipy.ndimage import label
 from ..errors import ErrorCode, ReconstructionError
 from ..maths.lines import nearest_to_lines
 from ..maths.projection import in_picture, projected, shown
-from ..scene import Camera, Decision, Progress, Region, SolvedCameras, View, to_unit_sphere
+from ..scene import Camera, Decision, Mask, Progress, Region, SolvedCameras, View, to_unit_sphere
 from .standing_alone import share_cut_off, standing_alone
 
 FEATURES_REACH = 1.1
@@ -261,7 +261,7 @@ def _of_hull(views: list[View], config: RegionConfig) -> tuple[Float64[np.ndarra
     Photographs from nearly one side leave the hull open in depth; there the subject is taken to be
     at most half again as deep as it is wide.
     """
-    first_centre, first_radius = _first_guess(views)
+    first_centre, first_radius = around_masks(views)
     centre, radius = first_centre, first_radius
     steps = np.linspace(-1, 1, config.hull_cells)
     unit_cells = np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), axis=-1)
@@ -269,7 +269,7 @@ def _of_hull(views: list[View], config: RegionConfig) -> tuple[Float64[np.ndarra
         cells = unit_cells * radius + centre
         counts = _masks_around(cells.reshape(-1, 3), views).reshape(cells.shape[:3])
         counts[np.linalg.norm(cells - first_centre, axis=-1) > first_radius] = 0
-        kept = cells[_without_ghosts(counts)]
+        kept = cells[without_ghosts(counts)]
         if not len(kept):
             raise ReconstructionError(
                 ErrorCode.NO_SURFACE,
@@ -320,7 +320,7 @@ def _share_filled(view: View, hull: Float64[np.ndarray, "cells 3"], cell: float)
     return float(filled[on].mean())
 
 
-def _without_ghosts(counts: Int64[np.ndarray, "x y z"]) -> Bool[np.ndarray, "x y z"]:
+def without_ghosts(counts: Int64[np.ndarray, "x y z"]) -> Bool[np.ndarray, "x y z"]:
     """Cells in at least two masks, in pieces that somewhere more than half of the best number show.
 
     Between two cameras that face each other, near one of them, lies space that both masks hold and that
@@ -334,13 +334,18 @@ def _without_ghosts(counts: Int64[np.ndarray, "x y z"]) -> Bool[np.ndarray, "x y
     return np.asarray(real, bool)
 
 
-def _first_guess(views: list[View]) -> tuple[Float64[np.ndarray, "3"], float]:
+def shows_subject(mask: Mask) -> bool:
+    """Whether there is anything but a slip on it."""
+    return bool(np.count_nonzero(mask > 0.5) >= _FEWEST_SUBJECT_PX)
+
+
+def around_masks(views: Sequence[View]) -> tuple[Float64[np.ndarray, "3"], float]:
     """Where the rays through the middles of the masks meet, and how large the masks are there."""
     directions, sizes_px = [], []
     for view in views:
         assert view.mask is not None
         rows, columns = np.nonzero(view.mask > 0.5)
-        if len(rows) < _FEWEST_SUBJECT_PX:
+        if not shows_subject(view.mask):
             raise ReconstructionError(
                 ErrorCode.MASK_UNUSABLE,
                 f"The mask of {view.name} is empty: only {len(rows)} pixels are brighter than half of white.",

@@ -66,6 +66,8 @@ class Job:
     region_centre: tuple[float, ...] | None = None
     """Of the sphere to reconstruct, three numbers in the frame of the cameras; None to find it."""
     region_radius: float | None = None
+    cut_out: bool = False
+    """Whether the subject is cut out of the photographs that have no masks."""
     without_ground: bool = False
     """Whether the flat ground that the subject stands on is left out."""
     budget_s: float | None = None

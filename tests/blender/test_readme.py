@@ -158,29 +158,31 @@ def test_what_is_left_out_is_not_the_panels(rehearsed: object, parts: Callable[[
     """The function's job is what its arguments say, whatever the scene's settings are."""
     settings = bpy.context.scene.fewview
     settings.preset, settings.seed, settings.truth = "detailed", 7, "nowhere.ply"
-    settings.without_ground = True
+    settings.without_ground = settings.cut_out = True
     done = parts("api").reconstruct(["photos"], output="jobs")
     job = json.loads((done.folder / "job.json").read_text(encoding="utf-8"))
     assert (job["preset"], job["seed"], job["truth"], job["cameras"]) == ("balanced", 0, None, None)
     assert not job["without_ground"]
+    assert not job["cut_out"]
     assert job["images"] == [str(Path("photos").absolute())]
     assert done.mesh == settings.result
     assert done.warnings
 
 
 @pytest.mark.parametrize("asked", [False, True])
-def test_the_ground_is_left_out_where_that_is_asked(
-    asked: bool, rehearsed: object, main: Callable[..., int]
+@pytest.mark.parametrize("what", ["without_ground", "cut_out"])
+def test_ground_and_surroundings_are_left_out_where_that_is_asked(
+    what: str, asked: bool, rehearsed: object, main: Callable[..., int]
 ) -> None:
     """By the function, through the command; by the operator's argument; by the scene's setting."""
-    assert main("reconstruct photos --output command" + " --without-ground" * asked) == 0
-    argument = {"without_ground": True} if asked else {}
+    assert main("reconstruct photos --output command" + f" --{what.replace('_', '-')}" * asked) == 0
+    argument = {what: True} if asked else {}
     bpy.ops.fewview.reconstruct(images="photos", output=str(Path("argument").absolute()), **argument)
-    bpy.context.scene.fewview.without_ground = asked
+    setattr(bpy.context.scene.fewview, what, asked)
     bpy.ops.fewview.reconstruct(images="photos", output=str(Path("setting").absolute()))
     for folder in ("command", "argument", "setting"):
         (written,) = Path(folder).glob("*/job.json")
-        assert json.loads(written.read_text(encoding="utf-8"))["without_ground"] == asked
+        assert json.loads(written.read_text(encoding="utf-8"))[what] == asked
 
 
 def test_no_images_and_missing_ones_are_said(parts: Callable[[str], ModuleType], tmp_path: Path) -> None:

@@ -7,6 +7,7 @@ import pytest
 from addon.progress import seconds_left, stage_words, time_words, total_share
 
 RUN = ["photos", "cameras", "region", "stereo", "train", "mesh", "report"]
+CUT_OUT = ["photos", "cameras", "cutout", "region", "stereo", "train", "mesh", "report"]
 FIT = ["points", "surface", "mesh"]
 
 
@@ -20,7 +21,7 @@ def shares(names: list[str]) -> list[float]:
 
 
 @pytest.mark.parametrize(
-    "names", [RUN, RUN[:3], FIT, ["render"], ["python", "packages", "check"], ["a", "b", "c"]]
+    "names", [RUN, RUN[:3], CUT_OUT, FIT, ["render"], ["python", "packages", "check"], ["a", "b", "c"]]
 )
 def test_it_goes_from_nothing_to_all_and_never_back(names: list[str]) -> None:
     found = shares(names)
@@ -29,7 +30,7 @@ def test_it_goes_from_nothing_to_all_and_never_back(names: list[str]) -> None:
     assert all(later >= earlier for earlier, later in pairwise(found))
 
 
-@pytest.mark.parametrize("names", [RUN, FIT])
+@pytest.mark.parametrize("names", [RUN, CUT_OUT, FIT])
 def test_a_stage_ends_where_the_next_begins(names: list[str]) -> None:
     found = shares(names)
     assert found[2:-1:3] == pytest.approx(found[3::3])

@@ -9,7 +9,7 @@ import pytest
 import backend.__main__ as program
 from backend import waiting
 from backend.commands.install import Plan
-from backend.commands.reconstruct import settings_of
+from backend.commands.reconstruct import resolve, settings_of
 from backend.errors import ReconstructionError
 from backend.wire.protocol import Job
 
@@ -41,6 +41,7 @@ def test_without_a_region_it_is_found(jobs: list[Job]) -> None:
         (["job.json", "--region", "1", "2", "3", "4"], "--region stands in the file"),
         (["job.json", "--budget-seconds", "4"], "--budget-seconds stands in the file"),
         (["job.json", "--without-ground"], "--without-ground stands in the file"),
+        (["job.json", "--cut-out"], "--cut-out stands in the file"),
     ],
 )
 def test_wrong_regions_and_double_options_end_with_a_sentence(
@@ -66,6 +67,14 @@ def test_the_ground_is_kept_unless_it_is_to_be_left_out(jobs: list[Job]) -> None
     assert [job.without_ground for job in jobs] == [False, True]
     stereo = [settings_of(job).stereo for job in jobs]
     assert [config.without_ground for config in stereo if config is not None] == [False, True]
+
+
+@pytest.mark.parametrize("command", ["reconstruct", "cameras"])
+def test_the_subject_is_cut_out_where_that_is_asked(jobs: list[Job], command: str) -> None:
+    program.run([command, "photos", "--output", "o"])
+    program.run([command, "photos", "--output", "o", "--cut-out"])
+    assert [job.cut_out for job in jobs] == [False, True]
+    assert [resolve(job, Path()).cut_out for job in jobs] == [False, True]
 
 
 def test_a_preset_without_points_cannot_leave_out_the_ground(jobs: list[Job]) -> None:

@@ -53,7 +53,7 @@ def test_a_bare_python_names_all_that_is_missing() -> None:
     assert "numpy" in last.text
     assert "torch" in last.text
     assert "-m pip install numpy pillow" in last.remedy
-    assert [message.fine for message in heard if isinstance(message, Checked)] == [True] + [False] * 15
+    assert [message.fine for message in heard if isinstance(message, Checked)] == [True] + [False] * 17
 
 
 def test_checks_come_one_by_one(monkeypatch: pytest.MonkeyPatch) -> None:

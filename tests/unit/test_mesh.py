@@ -38,6 +38,7 @@ from tests.synthetic_scene import (
     SIZE,
     Scene,
     arc_cameras,
+    camera_at,
     diagonal,
     photographed,
     surface_distance,
@@ -219,6 +220,20 @@ def test_what_fills_the_masks_shadow_behind_the_body_is_dropped() -> None:
         mesh = extract(scene, joined, measured(front_points()))
         assert as_trimesh(mesh.vertices, mesh.faces).body_count == pieces
         assert len(mesh.normals) == len(mesh.support) == len(mesh.colours_srgb) == len(mesh.vertices)
+
+
+def test_what_only_photographs_without_masks_show_is_dropped_beside_others_that_have_some() -> None:
+    """A ball beside the body, hidden by it from the cameras with masks and shown whole by one without."""
+    cameras = [*arc_cameras(2, 4, 160), camera_at(75, 1.0, 160)]
+    first, second, bare = photographed(cameras).views
+    joined = surface_of(np.minimum(surface_distance(node_positions()), ball([0.0, 0.95, 0.0], 0.2)))
+    for views, pieces in (
+        ((first, second, replace(bare, mask=None)), 1),
+        ((first, second, bare), 2),
+        ((first, replace(second, mask=None), replace(bare, mask=None)), 2),
+    ):
+        mesh = extract(replace(photographed(cameras), views=views), joined, measured(front_points()))
+        assert as_trimesh(mesh.vertices, mesh.faces).body_count == pieces
 
 
 # simplification

@@ -16,7 +16,7 @@ from backend.errors import Cancelled, ErrorCode, ReconstructionError
 from backend.pipeline import Job, Listener, Stages
 from backend.presets import PRESETS
 from backend.records import load_record
-from backend.scene import Photo, Region, SolvedCameras, StereoResult
+from backend.scene import CutOut, Photo, Region, SolvedCameras, StereoResult
 from backend.stages.stereo.multi_view_stereo import unmatched
 from backend.stages.surface import Surface
 from backend.workspace import StageCost, open_workspace
@@ -260,6 +260,45 @@ def test_what_stages_doubt_is_told(photos: Path) -> None:
     with open_workspace(job.output) as opened, pytest.raises(Cancelled):
         pipeline.run(job, opened, settings=SETTINGS, stages=stages, listener=listener)
     assert [text for text in warned if "doubt" in text] == ["the region's doubt", "stereo's doubt"]
+
+
+def test_the_subject_is_cut_out_between_cameras_and_region_where_that_is_asked(photos: Path) -> None:
+    """Region and stereo get the masks, the user the doubt; a run that does not ask has none of it."""
+    scene = photographed(arc_cameras(2, 20, 16))
+    views = tuple(replace(view, name=f"{index}.png", mask=None) for index, view in enumerate(scene.views))
+    solved = replace(scene, views=views).solved()
+    masks = tuple(view.mask for view in scene.views)
+    given: list[list[Any]] = []
+
+    def solve_cameras(*_: Any, **__: Any) -> SolvedCameras:
+        return solved
+
+    def cut_out(*_: Any, **__: Any) -> CutOut:
+        return CutOut(masks=masks, doubt="the cut-out's doubt")
+
+    def find_region(solved: SolvedCameras, *_: Any, **__: Any) -> Region:
+        given.append([view.mask for view in solved.views])
+        return true_region()
+
+    def match_views(solved: SolvedCameras, *_: Any, **__: Any) -> StereoResult:
+        given.append([view.mask for view in solved.views])
+        raise Cancelled
+
+    warned: list[str] = []
+    listener = Quiet()
+    listener.warned = warned.append  # type: ignore[method-assign]
+    stages = Stages(
+        solve_cameras=solve_cameras, cut_out=cut_out, find_region=find_region, match_views=match_views
+    )
+    for asked in (True, False):
+        job = replace(job_of(photos), cut_out=asked)
+        with open_workspace(job.output) as opened, pytest.raises(Cancelled):
+            pipeline.run(job, opened, settings=SETTINGS, stages=stages, listener=listener)
+    for found in given[:2]:
+        for mask, true in zip(found, masks, strict=True):
+            np.testing.assert_array_equal(mask, true)
+    assert given[2:] == [[None, None]] * 2
+    assert [text for text in warned if "doubt" in text] == ["the cut-out's doubt"]
 
 
 def test_a_finished_job_is_not_replaced_by_another_shoot(photos: Path, tmp_path: Path) -> None:

@@ -155,7 +155,10 @@ def _kept(
     normals = vertex_normals(vertices, faces)
     seen = visible_from(vertices, normals, [view.camera for view in views], RayCaster(vertices, faces))
     support = support_of(vertices, seen, points, stereo.points.confidence, reach)
-    whole, faces = len(faces), faces[in_seen_pieces(faces, seen)]
+    # photographs without masks, among others that have some, show what is beside the subject as well
+    telling = np.array([view.mask is not None for view in views])
+    shown = seen[:, telling] if telling.sum() >= 2 else seen
+    whole, faces = len(faces), faces[in_seen_pieces(faces, shown)]
     decisions: tuple[Decision, ...] = ()
     if len(points) and all(view.mask is None for view in views):
         beyond, decision = _open_or_closed(vertices, support, stereo.depth_maps, reach)

@@ -38,7 +38,8 @@ def disagreement(solved: SolvedCameras, stereo: StereoResult) -> tuple[str, ...]
             "Check positions, directions and focal lengths in the cameras file, or let FewView find them; "
             "a subject that was moved between photographs, but not its surroundings, looks the same."
         )
-    miss_px = None if solved.estimated else outlines_of_masks_miss_px(solved.views)
+    exact = not solved.estimated and not solved.masks_cut_out
+    miss_px = outlines_of_masks_miss_px(solved.views) if exact else None
     if miss_px is not None and miss_px >= _MISS_WIDTHS * longest_px:
         texts.append(
             f"With the cameras that were given the outlines of the masks miss each other by {miss_px:.2g} "

@@ -23,6 +23,7 @@ from ...maths.geometry import pinhole_in_object, pixel_centres, sample_image, un
 from ...maths.inverse_depth import fit_planes, normals_from_planes
 from ...maths.texture import leverage
 from ...scene import DepthMap, Progress, Region, StereoResult, SurfacePoints, View, within
+from .bare_views import only_on_masks
 from .config import StereoConfig
 from .depth_maps import Measured, depth_maps
 from .gaps import without_covered_patches
@@ -57,7 +58,8 @@ def match_views(
     found = StereoResult(points=points, depth_maps=full_size)
     if len(points.positions) < FEWEST_POINTS:
         return outlines_alone(found)
-    return without_hanging(replace(found, points=without_strays(points)), views, region)
+    found = only_on_masks(replace(found, points=without_strays(points)), views, region)
+    return without_hanging(found, views, region)
 
 
 def _check_pictures(views: tuple[View, ...]) -> None:

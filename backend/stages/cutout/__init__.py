@@ -1,0 +1,1 @@
+"""The subject cut out of photographs that came without masks."""
