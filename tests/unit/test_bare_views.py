@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from backend.maths.beside_mask import on_and_beside_mask
 from backend.scene import DepthMap, StereoResult, View, transform_points
 from backend.stages.stereo.bare_views import only_on_masks
 from tests.synthetic_scene import (
@@ -18,8 +19,8 @@ from tests.synthetic_scene import (
     true_region,
 )
 
-BESIDE = CENTRE + SIZE * np.array([[0.0, 0.0, 1.3], [1.6, 0.0, 0.0]])
-"""World frame; off the body in every photograph."""
+BESIDE = CENTRE + SIZE * np.array([[0.0, 0.0, 1.3], [1.15, 0.45, 0.36]])
+"""World frame: above all pictures, and beside the body in one of the first three."""
 
 
 @pytest.fixture(scope="module")
@@ -48,6 +49,11 @@ def stereo_of(scene: Scene) -> StereoResult:
 
 def bare(views: tuple[View, ...], which: list[int]) -> tuple[View, ...]:
     return tuple(replace(view, mask=None) if i in which else view for i, view in enumerate(views))
+
+
+def test_one_of_these_places_is_beside_one_mask_alone(scene: Scene) -> None:
+    beside = [on_and_beside_mask(view, BESIDE)[1] for view in scene.views[:3]]
+    np.testing.assert_array_equal(np.sum(beside, axis=0), [0, 1])
 
 
 def test_what_lies_beside_the_masks_is_left_out_of_the_bare_one(scene: Scene) -> None:

@@ -117,6 +117,18 @@ def test_a_mask_of_the_user_stands(scene: Scene, points: np.ndarray) -> None:
     assert all(mask is not None for mask in found[1:])
 
 
+def test_masks_of_the_user_count_as_agreeing(scene: Scene, points: np.ndarray) -> None:
+    """Though a side of each is missing, with which as cut-outs they would not be used, nor the others alone."""
+    masks = masks_of(scene)
+    for mask in masks[:4]:
+        assert mask is not None
+        mask[:, np.flatnonzero(mask.any(axis=0))[:14]] = 0
+    assert is_none(agreed(masks, bare(scene), points))
+    held = [replace(view, mask=mask) for view, mask in zip(scene.views[:4], masks, strict=False)]
+    found = agreed(masks, (*held, *bare(scene)[4:]), points)
+    assert [mask is None for mask in found] == [True] * 4 + [False] * 2
+
+
 def test_what_contradicts_masks_of_the_user_is_not_used() -> None:
     arc = photographed(arc_cameras(4, 75, 160))
     masks = masks_of(arc)

@@ -19,10 +19,11 @@ def scene() -> Scene:
     return photographed(arc_cameras(4, 75, 200))
 
 
-def told(cameras: list[Camera]) -> tuple[str, ...]:
+def told(cameras: list[Camera], **changes: bool) -> tuple[str, ...]:
     """Of the photographs with these cameras instead of theirs."""
     views = zip(scene().views, cameras, strict=True)
     solved = replace(scene().solved(), views=tuple(replace(view, camera=camera) for view, camera in views))
+    solved = replace(solved, **changes)  # type: ignore[arg-type]
     return disagreement(solved, matched(solved))
 
 
@@ -68,6 +69,11 @@ def test_focal_lengths_that_are_wrong_are_told() -> None:
     assert of_outlines.startswith(
         "With the cameras that were given the outlines of the masks miss each other"
     )
+
+
+def test_outlines_that_fewview_cut_out_itself_tell_nothing_of_cameras() -> None:
+    longer = [replace(camera, fx_px=10 * camera.fx_px, fy_px=10 * camera.fy_px) for camera in scene().cameras]
+    assert len(told(longer, masks_cut_out=True)) == 1
 
 
 def test_without_texture_outlines_tell() -> None:

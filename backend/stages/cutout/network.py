@@ -38,8 +38,10 @@ def load_network(progress: Progress) -> "InferenceSession":
     import onnxruntime  # a run that cuts out nothing need not wait for it
 
     path = Path(os.environ[_OTHER_FILE]) if os.environ.get(_OTHER_FILE) else _fetched(progress)
+    options = onnxruntime.SessionOptions()
+    options.enable_cpu_mem_arena = False  # a tenth slower, and 1.4 GB instead of 2.2
     try:
-        return onnxruntime.InferenceSession(path, providers=["CPUExecutionProvider"])
+        return onnxruntime.InferenceSession(path, options, providers=["CPUExecutionProvider"])
     except Exception as error:  # onnxruntime's errors have no other class in common
         text = f"The file {path} with the network that cuts out subjects cannot be used ({error})."
         remedy = f"Delete it, so that it is fetched again; {_WITHOUT}"
