@@ -1,12 +1,14 @@
 """Step 4: start, cancel, and what the job says."""
 
+import os
 from collections.abc import Sequence
 from pathlib import Path
 
 import bpy
 from bpy.props import FloatVectorProperty, StringProperty
 
-from ...backend.wire.client import backend_command
+from ...backend.wire.client import backend_command, clean_environment
+from ...backend.wire.environment import OFFLINE
 from ...backend.wire.photographs import photographs_in
 from ...backend.wire.protocol import PROTOCOL_VERSION, Finished, Job
 from .. import jobs
@@ -215,6 +217,7 @@ def start(python: Path, folder: Path, asked: Job, *, scene_name: str) -> None:
         on_preview=on_preview,
         on_end=remove_preview,
         remedy=IN_PAST_JOBS,
+        environment=None if bpy.app.online_access else {**clean_environment(os.environ), OFFLINE: "1"},
     )
 
 

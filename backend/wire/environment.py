@@ -17,6 +17,8 @@ RECORD = "env.json"
 PART, OLD, LOCK = ".part", ".old", ".lock"
 """What is added to the folder's name."""
 CONSTRAINTS = "constraints.txt"
+OFFLINE = "FEWVIEW_OFFLINE"
+"""Variable of a backend's environment: set where its caller must not go online."""
 BUILDS = ("default", "cpu", "cuda")
 """Builds of torch: what the package index offers for this system, the smallest, the one for NVIDIA's GPUs."""
 _SMALL_GB, _CUDA_GB = (0.6, 1.7), (3.2, 7.2)

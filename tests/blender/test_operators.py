@@ -217,6 +217,25 @@ def situation(addon: ModuleType, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
     preferences.system.use_online_access = online
 
 
+@pytest.mark.parametrize("allowed", [True, False])
+def test_a_reconstruction_may_go_online_where_blender_may(
+    allowed: bool, situation: Situation, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    (situation.online if allowed else situation.offline)()
+    module = situation.part("operators.reconstruct")
+    environments: list[dict[str, str] | None] = []
+    monkeypatch.setattr(module.jobs, "start", lambda *_, **k: environments.append(k["environment"]))
+    job = module.Job(protocol=module.PROTOCOL_VERSION, images=("photos",), output="result")
+    module.start(Path("python"), tmp_path / "job", job, scene_name=bpy.context.scene.name)
+    if allowed:
+        assert environments == [None]
+    else:
+        (environment,) = environments
+        assert environment is not None
+        assert environment["FEWVIEW_OFFLINE"] == "1"
+        assert "PYTHONPATH" in environment
+
+
 @pytest.fixture
 def settings(addon: ModuleType) -> Any:
     return bpy.context.scene.fewview

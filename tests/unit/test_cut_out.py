@@ -118,7 +118,7 @@ def test_a_mask_of_the_user_stands(scene: Scene, points: np.ndarray) -> None:
 
 
 def test_masks_of_the_user_count_as_agreeing(scene: Scene, points: np.ndarray) -> None:
-    """Though a side of each is missing, with which as cut-outs they would not be used, nor the others alone."""
+    """Though a side of each is missing, for which they would not be used if they were cut-outs."""
     masks = masks_of(scene)
     for mask in masks[:4]:
         assert mask is not None
@@ -307,6 +307,23 @@ def test_without_a_connection_the_remedy_names_file_and_folder(
         network.load_network(no_progress)
     assert "http://127.0.0.1:9/network.onnx into the folder" in raised.value.remedy
     assert str(tmp_path) in raised.value.remedy
+
+
+def test_where_that_is_not_allowed_nothing_is_fetched_but_what_is_there_is_used(
+    answers: list[bytes], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    content = brightness_network()
+    monkeypatch.setattr(network, "_MD5", md5(content))
+    answers.append(content)
+    monkeypatch.setenv("FEWVIEW_OFFLINE", "1")
+    with pytest.raises(ReconstructionError, match="not allowed to go online") as raised:
+        network.load_network(no_progress)
+    assert "Allow Online Access" in raised.value.remedy
+    assert answers == [content]
+    monkeypatch.delenv("FEWVIEW_OFFLINE")
+    network.load_network(no_progress)
+    monkeypatch.setenv("FEWVIEW_OFFLINE", "1")
+    network.load_network(no_progress)
 
 
 def test_fetching_can_be_cancelled_and_leaves_nothing(answers: list[bytes], tmp_path: Path) -> None:

@@ -15,6 +15,7 @@ from jaxtyping import Float32
 from ...errors import ErrorCode, ReconstructionError
 from ...images import resized
 from ...scene import Progress
+from ...wire.environment import OFFLINE
 
 if TYPE_CHECKING:
     from onnxruntime import InferenceSession
@@ -24,6 +25,7 @@ _FILE_NAME = _ADDRESS.rsplit("/", 1)[-1]
 _MD5 = "fc16ebd8b0c10d971d3513d564d01e29"
 _OTHER_FILE = "FEWVIEW_CUT_OUT_NETWORK"
 """Variable of the environment: a file with a network of the same inputs and outputs, to be used instead."""
+_WITHOUT = "or give masks of your own, or do without cutting out."
 _SIDE_PX = 1024
 """Of the square that the network sees."""
 _MIDDLE_GREY = 0.5
@@ -48,9 +50,6 @@ def load_network(progress: Progress) -> "InferenceSession":
         raise ReconstructionError(ErrorCode.NETWORK_UNAVAILABLE, text, remedy) from error
 
 
-_WITHOUT = "or give masks of your own, or do without Cut Out."
-
-
 def shown_subject(
     network: "InferenceSession", image_srgb: Float32[np.ndarray, "height width 3"]
 ) -> Float32[np.ndarray, "height width"]:
@@ -70,16 +69,24 @@ def _fetched(progress: Progress) -> Path:
 
     folder = Path(pooch.os_cache("fewview"))  # where programs keep what they fetch
     pooch.get_logger().setLevel("WARNING")
-    downloader = pooch.HTTPDownloader(progressbar=_Told(progress))
+    fetch = _refused if os.environ.get(OFFLINE) else pooch.HTTPDownloader(progressbar=_Told(progress))
     try:
-        found = pooch.retrieve(_ADDRESS, f"md5:{_MD5}", _FILE_NAME, folder, downloader=downloader)
+        found = pooch.retrieve(_ADDRESS, f"md5:{_MD5}", _FILE_NAME, folder, downloader=fetch)
     except (OSError, ValueError) as error:  # no connection, no room; what came is not the file
         offline = isinstance(error, requests.exceptions.ConnectionError | requests.exceptions.Timeout)
         why = "no connection" if offline else error
         text = f"The network that cuts out subjects could not be fetched ({why})."
-        remedy = f"Connect to the internet this once, or put {_ADDRESS} into the folder {folder}, {_WITHOUT}"
+        remedy = (
+            "Connect to the internet this once (in Blender: Preferences > System > Allow Online Access), or "
+            f"put {_ADDRESS} into the folder {folder}, {_WITHOUT}"
+        )
         raise ReconstructionError(ErrorCode.NETWORK_UNAVAILABLE, text, remedy) from error
     return Path(found)
+
+
+def _refused(*_: object) -> None:
+    """In place of what fetches."""
+    raise PermissionError("Blender is not allowed to go online")
 
 
 class _Told:
