@@ -63,9 +63,9 @@ STAGE_NAMES = (*CHECKPOINTED, "report")
 _UNTIL = {"cameras": ("photos", "cameras", "cutout", "region"), "report": STAGE_NAMES}
 """The stages of a run, by what it is asked for."""
 _CAMERA_FILES = frozenset({".json", ".txt", ".bin"})
-_BYTES_PER_PIXEL = MappingProxyType({"photos": 16, "cameras": 24, "stereo": 40})
-"""On disk, of each photograph: with its mask; its undistorted twin and what cameras are found by; depth and
-points. Measured: 12 to 16, 14 to 18, 8 to 23."""
+_BYTES_PER_PIXEL = MappingProxyType({"photos": 16, "cameras": 24, "cutout": 4, "stereo": 40})
+"""On disk, of each photograph: with its mask; its undistorted twin and what cameras are found by; a mask that
+was made; depth and points. Measured: 12 to 16, 14 to 18, 4, 8 to 23."""
 _SHORT_BY_LONG_SIDE = 0.75
 """Of most photographs; the others are a little narrower."""
 _BYTES_FOR_RESULTS = 400_000_000

@@ -140,7 +140,8 @@ def told_of_ground(stereo: StereoResult, views: tuple[View, ...], region: Region
     if angles_between(up / np.linalg.norm(up), ground.normal) > math.radians(_MOST_TILTED_DEG):
         return stereo
     doubt = "What was photographed stands on something flat, which becomes part of the mesh. "
-    doubt += "To leave that out, choose Without Ground, or --without-ground in a terminal."
+    doubt += "To leave that out, choose Without Ground, or Cut Out Subject where one thing stands out "
+    doubt += "(in a terminal --without-ground or --cut-out)."
     return replace(
         stereo,
         doubt=doubt,
