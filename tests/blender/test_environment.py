@@ -258,7 +258,7 @@ def test_a_python_without_packages_is_not_ready(preferences: Any, operators: Any
         bpy.ops.fewview.check_backend()
     found, reason = operators.backend_python_or_reason(bpy.context)
     assert found is None
-    assert "Missing: numpy, pillow, pillow-heif and 12 more" in reason
+    assert "Missing: numpy, pillow, pillow-heif and 14 more" in reason
     state, text = operators.backend_state(bpy.context)
     assert state.value == "not ready"
     assert "numpy" in text
