@@ -226,7 +226,7 @@ def test_a_reconstruction_may_go_online_where_blender_may(
     environments: list[dict[str, str] | None] = []
     monkeypatch.setattr(module.jobs, "start", lambda *_, **k: environments.append(k["environment"]))
     job = module.Job(protocol=module.PROTOCOL_VERSION, images=("photos",), output="result")
-    module.start(Path("python"), tmp_path / "job", job, scene_name=bpy.context.scene.name)
+    module.start(Path("python"), tmp_path, job, scene_name=bpy.context.scene.name)
     if allowed:
         assert environments == [None]
     else:
