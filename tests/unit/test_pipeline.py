@@ -350,10 +350,12 @@ def test_space_is_asked_for_by_photographs_their_size_and_what_is_to_come(
             (photos / f"{index}.xmp").touch()
 
     kept_after(job_of(photos), more_files)
-    all_stages = pipeline.STAGE_NAMES
+    cut_out = pipeline.STAGE_NAMES
+    all_stages = tuple(name for name in cut_out if name != "cutout")
     first, second = asked
     assert first == pipeline._needed_bytes(3, all_stages, SETTINGS)
     assert second == pipeline._needed_bytes(3, all_stages[1:], SETTINGS) < first
+    assert first < pipeline._needed_bytes(3, cut_out, SETTINGS)
     assert first < pipeline._needed_bytes(3, all_stages, PRESETS["detailed"])
     assert pipeline._needed_bytes(20, ("report",), SETTINGS) == pipeline._BYTES_FOR_RESULTS
 
