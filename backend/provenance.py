@@ -17,6 +17,7 @@ _COMPUTING_MODULES = (
     "pipeline.py",
     "point_methods.py",
     "scene.py",
+    "wire/environment.py",
     "wire/photographs.py",
 )
 _PACKAGES = (
@@ -31,6 +32,7 @@ _PACKAGES = (
     "fast-simplification",
     "pillow",
     "pillow-heif",
+    "onnxruntime",
 )
 """All that compute, or read photographs."""
 
