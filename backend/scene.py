@@ -47,7 +47,7 @@ class Photo:
     """File name, unique in the job."""
     path: Path
     image_srgb: Float32[np.ndarray, "height width 3"]
-    mask: Float32[np.ndarray, "height width"] | None
+    mask: Mask | None
     """1 on the subject, 0 off it; None where nothing is known."""
     original_width: int
     """Upright, before scaling down, in pixels."""
@@ -103,7 +103,7 @@ class View:
     name: str
     camera: Camera
     image_srgb: Float32[np.ndarray, "height width 3"]
-    mask: Float32[np.ndarray, "height width"] | None
+    mask: Mask | None
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -13,9 +13,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
-from scipy.ndimage import distance_transform_edt
 
-from ...maths.beside_mask import on_and_beside_mask
+from ...maths.beside_mask import FEWEST_MASKS, from_mask_px, on_and_beside_mask
 from ...maths.projection import projected, shown
 from ...scene import Mask, View
 from ..region import around_masks, shows_subject, without_ghosts
@@ -59,7 +58,7 @@ def agreed(
     ]
     masked = [replace(views[index], mask=known[index]) for index in which]
     nothing: list[Mask | None] = [None] * len(views)
-    cells = _around_most(masked) if len(masked) >= 2 else None
+    cells = _around_most(masked) if len(masked) >= FEWEST_MASKS else None
     if cells is None:
         return nothing
     seen = [_seen(view, cells) for view in masked]
@@ -70,7 +69,7 @@ def agreed(
     ]
     held = [index in given for index in which]
     kept = _without_contradictions([_seen(view, cells) for view in trimmed], held)
-    if len(kept) < max(2, _LEAST_USED * len(views)):
+    if len(kept) < max(FEWEST_MASKS, _LEAST_USED * len(views)):
         return nothing
     used = {which[number]: trimmed[number].mask for number in kept if not held[number]}
     return [used.get(index) for index in range(len(views))]
@@ -80,8 +79,10 @@ def _lacking(views: Sequence[View], points: Float64[np.ndarray, "points 3"]) -> 
     """Of each photograph, the share of the points on most masks that it shows off its own."""
     if not views or not len(points):
         return [0.0] * len(views)
-    on, beside = np.stack([on_and_beside_mask(view, points) for view in views], axis=1)
-    subject = (beside.sum(axis=0) <= _MOST_OFF * (on | beside).sum(axis=0)) & (on.sum(axis=0) >= 2)
+    said = [on_and_beside_mask(v.camera, from_mask_px(v.mask), points) for v in views if v.mask is not None]
+    on, beside = np.stack(said, axis=1)
+    few_off = beside.sum(axis=0) <= _MOST_OFF * (on | beside).sum(axis=0)
+    subject = few_off & (on.sum(axis=0) >= FEWEST_MASKS)
     return [float(lacks.mean()) for lacks in beside[:, subject]] if subject.any() else [0.0] * len(views)
 
 
@@ -152,8 +153,10 @@ def _seen(view: View, cells: _Cells) -> _Seen:
     visible = shown(pixels, depth, view.camera)
     column, row = pixels[visible].astype(int).T
     subject = view.mask > 0.5
-    from_subject_px = distance_transform_edt(~subject)[row, column]
-    near = from_subject_px <= _HALF_DIAGONAL * cells.width * view.camera.fx_px / depth[visible]
+    near = (
+        from_mask_px(view.mask)[row, column]
+        <= _HALF_DIAGONAL * cells.width * view.camera.fx_px / depth[visible]
+    )
     on, off = np.zeros((2, len(depth)), np.bool_)
     on[visible], off[visible] = near, ~near
     middle_depth = float(np.median(depth[visible])) if visible.any() else 1.0
@@ -176,14 +179,11 @@ def _seen(view: View, cells: _Cells) -> _Seen:
 
 def _in_most(seen: Sequence[_Seen]) -> Bool[np.ndarray, "cells"]:
     """Cells that are off the subject in few of the photographs that show them."""
-    on, off = (sum(np.asarray(of, np.int64) for of in said) for said in _said(seen))
+    on = np.sum([sees.on for sees in seen], axis=0)
+    off = np.sum([sees.off for sees in seen], axis=0)
     side = (_CELLS,) * 3
     counts = np.where(off <= _MOST_OFF * (on + off), on, 0)
     return without_ghosts(counts.reshape(side)).ravel()
-
-
-def _said(seen: Sequence[_Seen]) -> tuple[list[Bool[np.ndarray, "cells"]], list[Bool[np.ndarray, "cells"]]]:
-    return [sees.on for sees in seen], [sees.off for sees in seen]
 
 
 def _without_contradictions(seen: Sequence[_Seen], given: Sequence[bool]) -> list[int]:
@@ -191,14 +191,14 @@ def _without_contradictions(seen: Sequence[_Seen], given: Sequence[bool]) -> lis
 
     The worst is the one without which the others are filled best; one that was given never is.
     """
-    on, off = (np.stack(said).astype(np.int64) for said in _said(seen))
+    on, off = np.stack([sees.on for sees in seen]), np.stack([sees.off for sees in seen])
     kept = list(range(len(seen)))
 
     def filled(used: list[int]) -> list[float]:
-        common = (off[used].sum(axis=0) == 0) & (on[used].sum(axis=0) >= 2)
+        common = ~off[used].any(axis=0) & (on[used].sum(axis=0) >= FEWEST_MASKS)
         return [seen[number].filled_by(common) for number in used]
 
-    while len(kept) > 2 and min(filled(kept)) < _LEAST_FILLED:
+    while len(kept) > FEWEST_MASKS and min(filled(kept)) < _LEAST_FILLED:
         others = {number: [k for k in kept if k != number] for number in kept if not given[number]}
         if not others:
             break

@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float32, Float64, Int64
 from skimage.measure import marching_cubes
 
 from ...errors import ErrorCode, ReconstructionError
+from ...maths.beside_mask import FEWEST_MASKS
 from ...maths.clipping import clipped
 from ...maths.faces import area_vectors, face_areas
 from ...maths.grid import near_surface, refined, spacing
@@ -157,7 +158,7 @@ def _kept(
     support = support_of(vertices, seen, points, stereo.points.confidence, reach)
     # photographs without masks, among others that have some, show what is beside the subject as well
     telling = np.array([view.mask is not None for view in views])
-    shown = seen[:, telling] if telling.sum() >= 2 else seen
+    shown = seen[:, telling] if telling.sum() >= FEWEST_MASKS else seen
     whole, faces = len(faces), faces[in_seen_pieces(faces, shown)]
     decisions: tuple[Decision, ...] = ()
     if len(points) and all(view.mask is None for view in views):

@@ -4,18 +4,16 @@ It is the subject's only where masks have it: its own surface lies on every mask
 surrounds the subject would else become surface wherever no photograph with a mask shows that place.
 """
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Float64
 
-from ...maths.beside_mask import on_and_beside_mask
+from ...maths.beside_mask import FEWEST_MASKS, from_mask_px, on_and_beside_mask
 from ...maths.geometry import pinhole_in_object, seen_places
-from ...scene import Decision, Region, StereoResult, View, transform_points
-
-_FEWEST_MASKS = 2
-"""That show a place on the subject: one has a whole cone on it."""
+from ...scene import Camera, Decision, Region, StereoResult, View, transform_points
 
 
 def only_on_masks(stereo: StereoResult, views: tuple[View, ...], region: Region) -> StereoResult:
@@ -23,10 +21,10 @@ def only_on_masks(stereo: StereoResult, views: tuple[View, ...], region: Region)
 
     As it is where all views have masks, or fewer than two. The views' cameras are those of the depth maps.
     """
-    masked = [view for view in views if view.mask is not None]
     bare = np.array([view.mask is None for view in views])
-    if len(masked) < _FEWEST_MASKS or not bare.any():
+    if not bare.any() or (~bare).sum() < FEWEST_MASKS:
         return stereo
+    masked = [(view.camera, from_mask_px(view.mask)) for view in views if view.mask is not None]
     points = stereo.points
     kept = ~bare[points.view_index]
     kept[~kept] = _on_masks(points.positions[~kept], masked, region)
@@ -52,9 +50,14 @@ def only_on_masks(stereo: StereoResult, views: tuple[View, ...], region: Region)
 
 
 def _on_masks(
-    positions: Float[np.ndarray, "points 3"], masked: list[View], region: Region
+    positions: Float[np.ndarray, "points 3"],
+    masked: Sequence[tuple[Camera, Float64[np.ndarray, "_ _"]]],
+    region: Region,
 ) -> Bool[np.ndarray, "points"]:
-    """Whether places, object frame, lie on all masks that show them, and on two at least."""
+    """Whether places, object frame, lie on all masks that show them, and on two at least.
+
+    `masked` are cameras with the distances from their masks.
+    """
     places = transform_points(region.world_from_object, positions.astype(np.float64))
-    on, beside = np.stack([on_and_beside_mask(view, places) for view in masked], axis=1)
-    return np.asarray((on.sum(axis=0) >= _FEWEST_MASKS) & ~beside.any(axis=0))
+    on, beside = np.stack([on_and_beside_mask(*one, places) for one in masked], axis=1)
+    return np.asarray((on.sum(axis=0) >= FEWEST_MASKS) & ~beside.any(axis=0))
