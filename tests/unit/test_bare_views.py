@@ -4,10 +4,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 
+from backend.errors import ErrorCode, ReconstructionError
 from backend.maths.beside_mask import from_mask_px, on_and_beside_mask
-from backend.scene import DepthMap, StereoResult, View, transform_points
+from backend.scene import DepthMap, StereoResult, View, no_progress, transform_points
 from backend.stages.stereo.bare_views import only_on_masks
+from backend.stages.stereo.config import StereoConfig
+from backend.stages.stereo.multi_view_stereo import match_views
 from tests.synthetic_scene import (
     CENTRE,
     SIZE,
@@ -81,3 +85,14 @@ def test_what_lies_beside_the_masks_is_left_out_of_the_bare_one(scene: Scene) ->
 def test_where_all_have_masks_or_fewer_than_two_it_stays(scene: Scene, which: list[int]) -> None:
     stereo = stereo_of(scene)
     assert only_on_masks(stereo, bare(scene.views, which), true_region()) is stereo
+
+
+def test_where_hardly_anything_lies_on_masks_there_is_no_surface(scene: Scene) -> None:
+    """Two masks of a corner in which nothing is, and two photographs that measure the body."""
+    corner = np.zeros((120, 160), np.float32)
+    corner[:12, :12] = 1
+    masks = (corner, corner, None, None)
+    views = tuple(replace(view, mask=mask) for view, mask in zip(scene.views, masks, strict=True))
+    with pytest.raises(ReconstructionError) as raised:
+        match_views(views, true_region(), StereoConfig(), device=torch.device("cpu"), progress=no_progress)
+    assert raised.value.code == ErrorCode.NO_SURFACE

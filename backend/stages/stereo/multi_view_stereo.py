@@ -52,14 +52,13 @@ def match_views(
         nearby = neighbours([sizes[0].camera for sizes in pyramids], config.num_sources)
         sizes = depth_maps(pyramids, nearby, config, within(progress, 0.0, 0.95))
         points = _points(views, sizes, config)
-    check_enough(points, views, region)
     full_size = tuple(_full_size(view, maps, region, config) for view, maps in zip(views, sizes, strict=True))
     full_size = without_covered_patches(full_size, points, views, region)
-    found = StereoResult(points=points, depth_maps=full_size)
-    if len(points.positions) < FEWEST_POINTS:
+    found = only_on_masks(StereoResult(points=points, depth_maps=full_size), views, region)
+    check_enough(found.points, views, region)
+    if len(found.points.positions) < FEWEST_POINTS:
         return outlines_alone(found)
-    found = only_on_masks(replace(found, points=without_strays(points)), views, region)
-    return without_hanging(found, views, region)
+    return without_hanging(replace(found, points=without_strays(found.points)), views, region)
 
 
 def _check_pictures(views: tuple[View, ...]) -> None:
